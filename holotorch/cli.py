@@ -124,10 +124,24 @@ def _report(options: argparse.Namespace) -> int:
 def _chart(options: argparse.Namespace) -> int:
     from holotorch.experiments.chart import chart
 
-    out = options.out or Path("scripts/charts") / options.subject
-    print("\n".join(chart(options.subject, out)))
+    # The committed charts are of the full form, so that a quick one has another place.
+    charts = Path("runs/charts-quick" if options.quick else "scripts/charts")
+    if options.subject == "all":
+        return _chart_all(options.out or charts, options.quick)
+    out = options.out or charts / options.subject
+    print("\n".join(chart(options.subject, out, quick=options.quick)))
     print(out)
     return OK
+
+
+def _chart_all(out: Path, quick: bool) -> int:
+    from holotorch.experiments.chart_all import PAGE, chart_all, interrupted
+
+    outcomes = chart_all(out, quick=quick)
+    print(out / PAGE)
+    if interrupted(outcomes):
+        return INTERRUPTED
+    return FAILED if any(outcome.problem for outcome in outcomes.values()) else OK
 
 
 def _doctor(_: argparse.Namespace) -> int:
@@ -186,10 +200,11 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--out", type=Path, help="file to write (default: DIR/report.html; ./report.html for several)")
 
     chart = command("chart", _chart, "speed against accuracy of every method, drawn and tabled")
-    chart.add_argument(
-        "subject", help="what to chart: camera, chain, eye, joint, network, pec, propagation, tracking, volume"
-    )
-    chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
+    subjects = "camera, chain, eye, joint, network, pec, propagation, tracking, volume"
+    chart.add_argument("subject", help=f"what to chart: {subjects}, or all, on one page")
+    chart.add_argument("--quick", action="store_true", help="a reduced form of seconds, which tests no goal")
+    places = "scripts/charts/SUBJECT, with --quick runs/charts-quick/SUBJECT; of all: without SUBJECT"
+    chart.add_argument("--out", type=Path, help=f"folder for the chart (default: {places})")
 
     usage = "holotorch export-slm DIR --slm FILE [key=value ...] [--out OUT] [--encoding ENCODING] [--format FORMAT]"
     about = "frames for a phase panel from a run, and what those files show"

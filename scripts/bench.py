@@ -1,11 +1,17 @@
-"""Speed as ratios: contenders take turns in one process, and the median of their times is divided by the baseline's.
+"""Speed as ratios: contenders take turns in one process, and each time is divided by the baseline's of the same round.
 
-Usage: python scripts/bench.py [--against CHECKOUT] [SUBJECT ...]; without a subject, all of them. With ``--against``,
-every contender of this checkout takes turns with the same one of another, whose times are the baseline.
+Usage: python scripts/bench.py [--against CHECKOUT | --json FILE | --compare FILE] [SUBJECT ...]; without a subject, all
+of them. With ``--against``, every contender of this checkout takes turns with the same one of another, whose times are
+the baseline. ``--json`` writes the machine, the commit and the median and quartiles of every ratio to a file.
+``--compare`` measures again, names the contenders whose ratio grew since that file was written, and then exits with 1.
 """
 
 import argparse
+import datetime
+import importlib.util
+import json
 import os
+import platform
 import statistics
 import subprocess
 import sys
@@ -13,8 +19,10 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
+from ratios import FACTOR, Ratio, faster, from_json, missing, ratios, slower, to_json
 from torch.nn import functional
 
 from holotorch import Grid
@@ -213,15 +221,80 @@ def seconds(call: Callable[[], object]) -> float:
     return time.perf_counter() - started
 
 
-def measure(contenders: Contenders) -> dict[str, float]:
-    """Median seconds of each contender over ROUNDS rounds in which all of them take one turn."""
+def measure(contenders: Contenders) -> dict[str, list[float]]:
+    """Seconds of each contender in each of ROUNDS rounds, in which all of them take one turn."""
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for turn in range(WARM_UP + ROUNDS):
         for name, call in contenders.items():
             taken = seconds(call)
             if turn >= WARM_UP:
                 times[name].append(taken)
-    return {name: statistics.median(values) for name, values in times.items()}
+    return times
+
+
+def measured(names: list[str]) -> Iterator[list[Ratio]]:
+    """The ratios of each case of the subjects in turn, printed as they come."""
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads; medians of {ROUNDS} interleaved rounds")
+    for name in names:
+        for case, contenders in SUBJECTS[name]():
+            found = ratios(name, case, measure(contenders))
+            for each in found:
+                of_baseline = f"{each.milliseconds:9.3f} ms  {each.median:6.3f} of the baseline"
+                print(f"{name:12} {case:30} {each.contender:30} {of_baseline}", flush=True)
+            yield found
+
+
+def machine() -> dict[str, Any]:
+    """What the times depend on besides the code."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    cpu = {"cpu": model or platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    return cpu | {"torch": torch.__version__, "threads": torch.get_num_threads()}
+
+
+def about() -> dict[str, Any]:
+    """Machine, commit and date of a file of ratios."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        commit = subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    except OSError:  # no git
+        commit = ""
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return {"machine": machine(), "commit": commit, "date": now, "rounds": ROUNDS}
+
+
+def compare_file(names: list[str], path: Path, factor: float) -> int:
+    """Measure again, and print which contenders became slower since the file was written; 1 if any did.
+
+    A suspect's subject is measured a second time, and only what is slower in both counts: other work on the machine
+    that comes and goes can slow one contender of a case during a few rounds.
+    """
+    content = json.loads(path.read_text())
+    before = from_json(content)
+    known = {each.subject for each in before}
+    if differs := [key for key, value in machine().items() if content["machine"].get(key) != value]:
+        print(f"{path} is of another machine: {', '.join(differs)} differ, so that ratios may, too")
+    names = [name for name in names if name in known]
+    if not names:
+        sys.exit(f"{path} has only the subjects {', '.join(sorted(known))}")
+    after = [each for case in measured(names) for each in case]
+    suspects = slower(before, after, factor)
+    if suspects:
+        again = list(dict.fromkeys(change.after.subject for change in suspects))
+        print(f"measured once more, since something seems slower: {', '.join(again)}")
+        both = {each.after.key for each in slower(before, [r for case in measured(again) for r in case], factor)}
+        suspects = [change for change in suspects if change.after.key in both]
+    for change in faster(before, after, factor):
+        print(f"faster, or its baseline is slower: {change}")
+    for key in missing(before, after):
+        print(f"only in one of both: {', '.join(key)}")
+    for change in suspects:
+        print(f"slower: {change}")
+    print(f"{len(suspects)} of {len(after)} ratios grew by more than {factor:g} and beyond their quartiles")
+    return 1 if suspects else 0
 
 
 def answer(names: list[str]) -> None:
@@ -277,10 +350,17 @@ def main() -> None:
     """Print one line per contender and case."""
     parser = argparse.ArgumentParser(description="Speed as ratios.")
     parser.add_argument("subjects", nargs="*", help=f"of {', '.join(SUBJECTS)}; all of them by default")
-    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this project")
+    ways = parser.add_mutually_exclusive_group()
+    ways.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this project")
+    ways.add_argument("--json", type=Path, metavar="FILE", help="write machine, commit, date and all ratios")
+    ways.add_argument("--compare", type=Path, metavar="FILE", help="measure again; exit 1 if a ratio of FILE grew")
+    about_factor = f"by how much it must have grown, with --compare (default: {FACTOR:g})"
+    parser.add_argument("--factor", type=float, default=FACTOR, help=about_factor)
     parser.add_argument("--answer", action="store_true", help=argparse.SUPPRESS)
     asked = parser.parse_args()
-    names = asked.subjects or list(SUBJECTS)
+    # Without the package of the peer, all subjects are all others.
+    installed = importlib.util.find_spec("torchoptics") is not None
+    names = asked.subjects or [name for name in SUBJECTS if name != "peer" or installed]
     unknown = [name for name in names if name not in SUBJECTS]
     if unknown:
         sys.exit(f"unknown subject {', '.join(unknown)}; known: {', '.join(SUBJECTS)}")
@@ -290,13 +370,13 @@ def main() -> None:
         if not (asked.against / "holotorch").is_dir():
             sys.exit(f"--against expects a checkout with a folder holotorch, got {asked.against}")
         return compare(names, asked.against)
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads; medians of {ROUNDS} interleaved rounds")
-    for name in names:
-        for case, contenders in SUBJECTS[name]():
-            medians = measure(contenders)
-            base = next(iter(medians.values()))
-            for contender, value in medians.items():
-                print(f"{name:12} {case:30} {contender:30} {value * 1e3:9.3f} ms  {value / base:6.3f} of the baseline")
+    if asked.compare:
+        if not asked.compare.is_file():
+            sys.exit(f"--compare expects a file that --json wrote, got {asked.compare}")
+        sys.exit(compare_file(names, asked.compare, asked.factor))
+    found = [each for case in measured(names) for each in case]
+    if asked.json:
+        asked.json.write_text(json.dumps(to_json(found, about()), indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Charts of speed against accuracy: every method on the same task, as a figure and a table."""
 
+import warnings
 from importlib import import_module
 from pathlib import Path
 
@@ -8,31 +9,37 @@ from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text
 
 # The module whose function ``subject`` draws the chart, and the name of its second table. Functions that return several
-# further tables return them by name instead.
+# further tables return them by name instead. The subjects whose full form takes the least time come first.
 CHARTS = {
-    "camera": ("holotorch.experiments.camera.chart", "corrected"),
-    "chain": ("holotorch.experiments.joint.chain", ""),
-    "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
-    "joint": ("holotorch.experiments.joint.chart", ""),
-    "network": ("holotorch.experiments.network.chart", "training"),
-    "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
     "propagation": ("holotorch.experiments.propagation.chart", "prediction"),
-    "tracking": ("holotorch.experiments.tracking_benchmark.chart", "grids"),
     "volume": ("holotorch.experiments.volume.chart", "scaling"),
+    "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
+    "camera": ("holotorch.experiments.camera.chart", "corrected"),
+    "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
+    "network": ("holotorch.experiments.network.chart", "training"),
+    "joint": ("holotorch.experiments.joint.chart", ""),
+    "chain": ("holotorch.experiments.joint.chain", ""),
+    "tracking": ("holotorch.experiments.tracking_benchmark.chart", "grids"),
 }
+QUICK_FORM = "Quick form: smaller and fewer cases, no goal is tested"  # how the verdict of a quick chart begins
 
 
-def chart(subject: str, out: Path) -> list[str]:
-    """Write the figures, tables and verdict of a chart into the folder ``out``; returns the lines of the verdict."""
+def chart(subject: str, out: Path, *, quick: bool = False) -> list[str]:
+    """Write the figures, tables and verdict of a chart into the folder ``out``; returns the lines of the verdict.
+
+    ``quick`` draws the reduced form of the subject, which takes seconds; its verdict says so and compares with no goal.
+    """
     if subject not in CHARTS:
-        raise ConfigError([f"no chart of {subject!r}; known: {', '.join(CHARTS)}"])
+        raise ConfigError([f"no chart of {subject!r}; known: {', '.join(sorted(CHARTS))}"])
     module, second = CHARTS[subject]
-    draw = getattr(import_module(module), subject)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError([f"cannot write to {out}: {error.strerror}; choose another place with --out"]) from None
-    rows, further, figures, verdict = draw()
+    with warnings.catch_warnings():  # a subject may ignore warnings; the next one should not
+        rows, further, figures, verdict = getattr(import_module(module), subject)(quick=quick)
+    if quick:
+        verdict = [f"{QUICK_FORM}. {verdict[0]}", *verdict[1:]]
     write_table(out / "chart.csv", rows)
     for name, table in (further if isinstance(further, dict) else {second: further}).items():
         write_table(out / f"{name}.csv", table)
@@ -40,3 +47,8 @@ def chart(subject: str, out: Path) -> list[str]:
         write_bytes(out / f"{name}.png", data)
     write_text(out / "verdict.txt", "\n".join(verdict) + "\n")
     return verdict
+
+
+def description(subject: str) -> str:
+    """What the chart of a subject shows, in one sentence."""
+    return (import_module(CHARTS[subject][0]).__doc__ or "").splitlines()[0]

@@ -1,6 +1,7 @@
 """Chart of calibration with a camera: what is recovered from how many images, and what correction gains by it."""
 
 import time
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -20,31 +21,45 @@ from holotorch.modulator import Response
 GRID, WAVELENGTH = Grid(128, 9e-6), 530e-9
 SIGMA, DISTANCE = 0.66, 50e-3  # px and metres, of the true chip
 WRONG_SIGMA, WRONG_BY = 1.2, 1e-3  # factor on sigma, and metres of distance, in the uncalibrated model
-NOISES = (0.0, 0.01, 0.03, 0.1)  # standard deviation of a pixel of the camera relative to its mean value
-CAPTURES = (1, 2, 4, 16)
-SEEDS = (0, 1, 2)
-PICTURES = ("camera", "astronaut")
-FRAMES = 4
-NOMINAL = (0.01, 16)  # noise and captures whose calibration is used for correction
 UNITS = {"propagator.distance": 1e-5, "response.phases": 0.05}
-TRAINING, RATE = 200, 3e-3  # steps and rate of Adam for the residual network
+RATE = 3e-3  # rate of Adam for the residual network
 
 
-def camera() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
+@dataclass(frozen=True)
+class Amount:
+    """Size of the measurement."""
+
+    noises: tuple[float, ...] = (0.0, 0.01, 0.03, 0.1)  # standard deviation of a camera's pixel relative to its mean
+    captures: tuple[int, ...] = (1, 2, 4, 16)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    pictures: tuple[str, ...] = ("camera", "astronaut")
+    nominal: tuple[float, int] = (0.01, 16)  # noise and captures whose calibration is used for correction
+    frames: int = 4  # of a corrected picture
+    steps: tuple[int, int] = (100, 300)  # of the correction
+    training: int = 200  # steps of Adam for the residual network
+
+
+FULL = Amount()
+QUICK = Amount((0.01,), (1, 2), (0,), ("camera",), nominal=(0.01, 2), frames=2, steps=(10, 20), training=20)
+
+
+def camera(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     """Table rows of the recovery and of the correction, PNG pictures by name, and lines of text."""
+    amount = QUICK if quick else FULL
     rows, models = [], {}
-    for noise, captures, seed in tqdm(list(product(NOISES, CAPTURES, SEEDS)), desc="calibrating", unit="fit"):
+    fits = list(product(amount.noises, amount.captures, amount.seeds))
+    for noise, captures, seed in tqdm(fits, desc="calibrating", unit="fit"):
         row, model = _recovered(noise, captures, seed)
         rows.append(row)
-        if (noise, captures) == NOMINAL:
+        if (noise, captures) == amount.nominal:
             models[seed] = model
-    corrected, shown = _corrected(models)
-    unmodelled = _unmodelled()
+    corrected, shown = _corrected(models, amount)
+    unmodelled = _unmodelled(amount)
     return (
         rows,
         corrected + unmodelled,
-        {"chart": _draw(rows), "pictures": fitted_pictures(shown)},
-        _verdict(rows, corrected, unmodelled),
+        {"chart": _draw(rows, amount), "pictures": fitted_pictures(shown)},
+        _verdict(rows, corrected, unmodelled, amount),
     )
 
 
@@ -130,37 +145,45 @@ def _picture(name: str) -> Tensor:
     return small / small.mean()
 
 
-def _corrected(models: dict[int, Chip]) -> tuple[list[dict], dict[str, Tensor]]:
+def _corrected(models: dict[int, Chip], amount: Amount) -> tuple[list[dict], dict[str, Tensor]]:
     """Table rows of the correction on the true chip by each model, and pictures of the first."""
     rows, shown, true = [], {}, true_chip()
     contenders = [("uncalibrated", 0, uncalibrated()), *(("calibrated", seed, each) for seed, each in models.items())]
     contenders.append(("exact", 0, true))
-    for name, (label, seed, model) in tqdm(list(product(PICTURES, contenders)), desc="correcting", unit="picture"):
+    for name, (label, seed, model) in tqdm(
+        list(product(amount.pictures, contenders)), desc="correcting", unit="picture"
+    ):
         target = _picture(name)
-        drive = model.requires_grad_(False).corrected(target, frames=FRAMES, generator=torch.Generator().manual_seed(7))
+        drive = _drive(model, target, amount)
         rows.append({"chip": "as modelled", "model": label, "seed": seed, "picture": name,
                      "ssim_expected": quality(model, drive, target), "ssim": quality(true, drive, target)})  # fmt: skip
-        if name == PICTURES[0] and seed == 0:
+        if name == amount.pictures[0] and seed == 0:
             shown |= {"wanted": target, label: true(drive).mean(-4)}
     return rows, shown
 
 
-def _unmodelled() -> list[dict]:
+def _drive(model: Chip, target: Tensor, amount: Amount) -> Tensor:
+    """Drives that show ``target`` by the model."""
+    generator = torch.Generator().manual_seed(7)
+    return model.requires_grad_(False).corrected(target, frames=amount.frames, generator=generator, steps=amount.steps)
+
+
+def _unmodelled(amount: Amount) -> list[dict]:
     """Table rows for a chip with a fault that the model lacks, without and with a residual network."""
-    true, target = true_chip(Fault()), _picture(PICTURES[0])
-    drives, images = captured(true, *NOMINAL, seed=0)
+    true, target = true_chip(Fault()), _picture(amount.pictures[0])
+    drives, images = captured(true, *amount.nominal, seed=0)
     model, _ = calibrated(drives, images)
     rows = []
     for label in ("calibrated", "calibrated, with residual network"):
         if "network" in label:
-            _train(model, drives, images)
-        drive = model.requires_grad_(False).corrected(target, frames=FRAMES, generator=torch.Generator().manual_seed(7))
-        rows.append({"chip": "with a fault", "model": label, "seed": 0, "picture": PICTURES[0],
+            _train(model, drives, images, amount.training)
+        drive = _drive(model, target, amount)
+        rows.append({"chip": "with a fault", "model": label, "seed": 0, "picture": amount.pictures[0],
                      "ssim_expected": quality(model, drive, target), "ssim": quality(true, drive, target)})  # fmt: skip
     return rows
 
 
-def _train(model: Chip, drives: Tensor, images: Tensor) -> None:
+def _train(model: Chip, drives: Tensor, images: Tensor, steps: int) -> None:
     """Add a residual network to ``model`` and train it, with the other parameters, on the captured images."""
     torch.manual_seed(0)
     model.residual = FieldResidual(GRID)
@@ -168,7 +191,7 @@ def _train(model: Chip, drives: Tensor, images: Tensor) -> None:
     optimiser = torch.optim.Adam([{"params": list(parts[0])}, {"params": parts[1], "lr": RATE / 10}], lr=RATE)
     model.requires_grad_(True)
     generator = torch.Generator().manual_seed(0)
-    for _ in tqdm(range(TRAINING), desc="training", unit="step"):
+    for _ in tqdm(range(steps), desc="training", unit="step"):
         some = torch.randperm(len(drives), generator=generator)[:4]
         optimiser.zero_grad()
         predicted = model(drives[some])
@@ -177,50 +200,55 @@ def _train(model: Chip, drives: Tensor, images: Tensor) -> None:
         optimiser.step()
 
 
-def _verdict(rows: list[dict], corrected: list[dict], unmodelled: list[dict]) -> list[str]:
-    nominal = [row for row in rows if (row["noise"], row["captures"]) == NOMINAL]
+def _verdict(rows: list[dict], corrected: list[dict], unmodelled: list[dict], amount: Amount) -> list[str]:
+    noise, captures = amount.nominal
+    nominal = [row for row in rows if (row["noise"], row["captures"]) == amount.nominal]
     noisy = [row for row in rows if row["noise"] > 0]
 
     def worst(column: str) -> float:
         return max(float(row[column]) for row in nominal)
 
+    def asked(goal: str) -> str:
+        return f" (asked {goal})" if amount == FULL else ""
+
     lines = [
         f"from sigma {100 * (WRONG_SIGMA - 1):.0f} % wrong, a response 5 % wrong and {1e3 * WRONG_BY:g} mm of distance "
-        f"{NOMINAL[1]} captures of {100 * NOMINAL[0]:g} % noise recover sigma to {worst('sigma_error_percent'):.2g} % "
-        f"(asked 1), the distance to {worst('distance_error_mm'):.2g} mm (asked 0.1) and the response to "
-        f"{worst('response_error_rad'):.2g} rad, at worst of {len(SEEDS)} seeds; in the median in "
+        f"{captures} captures of {100 * noise:g} % noise recover sigma to {worst('sigma_error_percent'):.2g} %"
+        f"{asked('1')}, the distance to {worst('distance_error_mm'):.2g} mm{asked('0.1')} and the response to "
+        f"{worst('response_error_rad'):.2g} rad, at worst of {len(amount.seeds)} seed(s); in the median in "
         f"{np.median([row['seconds'] for row in nominal]):.0f} s",
         f"errors of sigma and distance over all {len(noisy)} fits with noise: "
         f"{np.mean([row[key] < 2 for row in noisy for key in ('sigma_deviations', 'distance_deviations')]):.0%} within "
         "2 of the stated standard deviations (95 % expected)",
     ]
-    for picture in PICTURES:
+    for picture in amount.pictures:
         of = {label: [r["ssim"] for r in corrected if (r["model"], r["picture"]) == (label, picture)]
               for label in ("uncalibrated", "calibrated", "exact")}  # fmt: skip
         lines.append(
             f"{picture}: SSIM on the true chip {of['uncalibrated'][0]:.3f} by the uncalibrated model, at worst "
             f"{min(of['calibrated']):.3f} by the calibrated one, {of['exact'][0]:.3f} by the exact one "
-            f"({of['exact'][0] - min(of['calibrated']):+.4f} short, asked 0.01)"
+            f"({of['exact'][0] - min(of['calibrated']):+.4f} short{asked('0.01')})"
         )
     before, after = (row["ssim"] for row in unmodelled)
     lines.append(
         f"a chip with uneven light and a warp that the model lacks: SSIM {before:.3f} calibrated, {after:.3f} with a "
-        f"residual network trained on the same {NOMINAL[1]} captures"
+        f"residual network trained on the same {captures} captures"
     )
     return lines
 
 
-def _draw(rows: list[dict]) -> bytes:
+def _draw(rows: list[dict], amount: Amount) -> bytes:
     """PNG of the errors against the number of captures, one line for each noise level; the worst of the seeds."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     columns = {"sigma_error_percent": "error of sigma in %", "distance_error_mm": "error of distance in mm",
                "response_error_rad": "largest error of response in rad"}  # fmt: skip
     for axes, (column, label) in zip(figure.subplots(1, 3), columns.items(), strict=True):
-        for noise in NOISES:
-            worst = [max(float(r[column]) for r in rows if (r["noise"], r["captures"]) == (noise, n)) for n in CAPTURES]
-            axes.loglog(CAPTURES, np.maximum(worst, 1e-9), "o-", label=f"noise {100 * noise:g} %")
+        for noise in amount.noises:
+            own = [row for row in rows if row["noise"] == noise]
+            worst = [max(float(row[column]) for row in own if row["captures"] == n) for n in amount.captures]
+            axes.loglog(amount.captures, np.maximum(worst, 1e-9), "o-", label=f"noise {100 * noise:g} %")
         axes.set(xlabel="captures", ylabel=label)
-        axes.set_xticks(CAPTURES, [str(n) for n in CAPTURES])
+        axes.set_xticks(amount.captures, [str(n) for n in amount.captures])
         axes.grid(alpha=0.3)
     figure.axes[0].legend(fontsize=8)
     return figure_png(figure)

@@ -53,14 +53,19 @@ class Chip(nn.Module):
         """Field at the camera for the field on the chip."""
         return self.propagator(field if self.residual is None else self.residual(field))
 
-    def corrected(self, target: Tensor, *, frames: int, generator: torch.Generator) -> Tensor:
-        """Drives [F, C, H, W] whose mean intensity, by this model, is ``target`` [C, H, W] but for a gain."""
+    def corrected(
+        self, target: Tensor, *, frames: int, generator: torch.Generator, steps: tuple[int, int] = (100, 300)
+    ) -> Tensor:
+        """Drives [F, C, H, W] whose mean intensity, by this model, is ``target`` [C, H, W] but for a gain.
+
+        ``steps``: of L-BFGS, on the amplitudes and then on the intensities.
+        """
         setup = self._spread, self.propagated, target
         # From a nearly plain drive, and with the amplitudes first, little light leaves the window as speckle.
         drive = 3 + 0.3 * torch.rand(frames, *target.shape, generator=generator, dtype=target.dtype)
-        for amplitude, steps in ((True, 100), (False, 300)):
+        for amplitude, most in zip((True, False), steps, strict=True):
             problem = PECProblem(*setup, scale_free=True, amplitude=amplitude, frames=True)
-            drive = LBFGS(max_steps=steps)(problem, drive, Box(0.0, LIMIT)).x
+            drive = LBFGS(max_steps=most)(problem, drive, Box(0.0, LIMIT)).x
         return drive
 
     def _spread(self, drive: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
 from holotorch.experiments.eye.run import scene_settings
 from holotorch.experiments.eye.tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.runs.figures import figure_png
+from holotorch.experiments.runs.figures import draw_front, figure_png, mark_choice
 from holotorch.experiments.timing import timed
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.io.bundled import find_config
@@ -28,26 +28,42 @@ from holotorch.optics.viewing.elementwise import ElementSampling, least_oversamp
 from holotorch.optics.viewing.imaging import propagate_collapsed
 from holotorch.optics.viewing.retina import plan_retina
 
-SIDE = 512  # pixels along each side of the hologram
-DISTANCES = (10e-3, 20e-3, 30e-3)  # distances from hologram to scene, in metres
 FOCUS = 30e-3  # distance from hologram to the depth in focus, in metres
-HOLOGRAM = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
-SCENE = f"scene={{config: configs/volume/c60.yaml, change: ['{HOLOGRAM}']}}"
 FACTORS = (1.0, 2.0, 4.0)  # oversampling by elements: pitch of the hologram / pitch on eyepiece and eye
+COLLAPSE = "collapse"  # the method that ``Retina`` uses
 
 
-def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
+@dataclass(frozen=True)
+class Amount:
+    """Size of the measurement."""
+
+    side: int = 512  # pixels along each side of the hologram
+    depths: int = 58  # planes of the scene
+    distances: tuple[float, ...] = (10e-3, 20e-3, 30e-3)  # distances from hologram to scene, in metres
+    sources: tuple[str, ...] = tuple(PRESETS)
+    others: int = 12  # realisations of the reference of the trade-off
+
+
+FULL = Amount()
+QUICK = Amount(96, 8, (30e-3,), ("laser",), others=2)
+
+
+def eye(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     """Table rows of methods and sources, table rows of the trade-off, PNG pictures by name, and lines of text."""
+    amount = QUICK if quick else FULL
     path = find_config("configs/eye/teapot.yaml")
     assert path is not None  # bundled with the package
-    settings = load_config(path, [SCENE])
+    shape = f"shape: [{amount.side}, {amount.side}], depths: {amount.depths}, rays: {amount.side // 2}"
+    hologram = f"hologram={{{shape}, pitch: 3.74 um, distance: 30 mm}}"
+    settings = load_config(path, [f"scene={{config: configs/volume/c60.yaml, change: ['{hologram}']}}"])
     assert isinstance(settings, ObserverSettings)
     scene = scene_settings(settings)
     methods = _methods(_quarter_size(settings, scene))
-    counts = _counts(observer(settings.model_copy(update={"focus": (FOCUS,)}), scene))
-    cases = tradeoff(settings, scene, DISTANCES)
+    counts = _counts(observer(settings.model_copy(update={"focus": (FOCUS,)}), scene), amount)
+    cases = tradeoff(settings, scene, amount.distances, others=amount.others)
     rows = [case.row(fitted_prefactor(cases)) for case in cases]
-    return methods + counts, rows, {"chart": _draw(methods, counts, cases)}, _verdict(methods, counts, cases)
+    pictures = {"chart": _draw(methods, counts, cases, amount)}
+    return methods + counts, rows, pictures, _verdict(methods, counts, cases, amount)
 
 
 def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
@@ -80,7 +96,7 @@ def _methods(observer: Observer) -> list[dict]:
     reference = intensity(by_elements(1.3))
     plan = plan_retina(grid, [wavelength], display, eye, **setup)
     needed = max(least.oversampling)
-    calls: dict[str, Any] = {"collapse": partial(propagate_collapsed, field, grid, [wavelength], display, eye, **setup)}
+    calls: dict[str, Any] = {COLLAPSE: partial(propagate_collapsed, field, grid, [wavelength], display, eye, **setup)}
     for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):
         name = f"elements, {factor:.2g} x" + (", the thesis's sampling" if factor == 1 else "")
         calls[name] = partial(by_elements, factor / needed)
@@ -89,7 +105,7 @@ def _methods(observer: Observer) -> list[dict]:
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the chart shows this aliasing
             call()  # warms up
             image, seconds = timed(call)
-        predicted = f"{plan.predicted_error:.1e}" if name == "collapse" else ""
+        predicted = f"{plan.predicted_error:.1e}" if name == COLLAPSE else ""
         rows.append(_row("way", name, seconds, _error(intensity(image), reference), predicted))
     return rows
 
@@ -101,7 +117,7 @@ def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
     return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
 
 
-def _counts(observer: Observer) -> list[dict]:
+def _counts(observer: Observer, amount: Amount) -> list[dict]:
     """Table rows with the error of a green picture by number of wavelengths; the reference has one every nanometre.
 
     "followed": the picture is the sum over all wavelengths, but only this number of them is propagated; the pictures at
@@ -116,8 +132,8 @@ def _counts(observer: Observer) -> list[dict]:
         return spectral_image(field, grid, wavelengths, weights, observer.display, eye, count=count)
 
     rows = []
-    for source, make in PRESETS.items():
-        spectrum = make(wavelength)
+    for source in amount.sources:
+        spectrum = PRESETS[source](wavelength)
         wavelengths, weights = spectrum.every(1e-9)
         total = len(wavelengths)
         reference, seconds = timed(partial(image, wavelengths, weights, total))
@@ -146,12 +162,14 @@ def _row(subject: str, what: str, seconds: float, error: str, predicted: str = "
     return {"subject": subject, "what": what, "seconds": f"{seconds:.3f}", "error": error, "predicted": predicted}
 
 
-def _verdict(methods: list[dict], counts: list[dict], cases: list[Case]) -> list[str]:
-    lines = [f"torch {torch.__version__}, {torch.get_num_threads()} threads; {SIDE} px, synthetic C60, 520 nm"]
+def _verdict(methods: list[dict], counts: list[dict], cases: list[Case], amount: Amount) -> list[str]:
+    lines = []
     for row in methods:
         predicted = f" (predicted {row['predicted']})" if row["predicted"] else ""
         lines.append(f"{row['what']}: error {row['error']}{predicted}, {row['seconds']} s")
-    for source in PRESETS:
+    setup = f"torch {torch.__version__}, {torch.get_num_threads()} threads; {amount.side} px, synthetic C60, 520 nm"
+    lines.insert(1, setup)
+    for source in amount.sources:
         selected = [row for row in counts if row["subject"] == source]
         full = float(selected[0]["seconds"])
         derived = [
@@ -161,16 +179,20 @@ def _verdict(methods: list[dict], counts: list[dict], cases: list[Case]) -> list
         ]
         alone = [f"{row['what']} {row['error']}" for row in selected if "alone" in row["what"]]
         lines += [f"{source}: " + "; ".join(derived), f"{source}: " + "; ".join(alone)]
-    return lines + in_words(cases)
+    # Without an optimum inside the widths tried, nothing can be said of it.
+    return lines + (in_words(cases) if any(case.inside for case in cases) else [])
 
 
-def _draw(methods: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
+def _draw(methods: list[dict], counts: list[dict], cases: list[Case], amount: Amount) -> bytes:
     figure = Figure(figsize=(16, 5), layout="constrained")
     first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
-    for k, row in enumerate(methods):
-        first.loglog(float(row["seconds"]), max(float(row["error"]), 1e-6), "os^vDP"[k % 6], label=row["what"])
+    points = {row["what"]: (float(row["seconds"]), max(float(row["error"]), 1e-6)) for row in methods}
+    for k, (name, point) in enumerate(points.items()):
+        first.loglog(*point, "os^vDP"[k % 6], label=name)
+    draw_front(first, points.values())
+    mark_choice(first, [points[COLLAPSE]])
     first.set(xlabel="seconds", ylabel="relative L2 error of the retina's intensity")
-    for k, source in enumerate(PRESETS):
+    for k, source in enumerate(amount.sources):
         for how, line in (("followed", "o-"), ("alone", "x:")):
             selected = [row for row in counts if row["subject"] == source and how in row["what"]]
             points = [(int(row["what"].split()[0]), float(row["error"])) for row in selected]

@@ -3,6 +3,7 @@
 import math
 import time
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,18 +27,32 @@ from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import Retina, RetinaViews, SpectralRetina, propagate, tone_map
 from holotorch.optics.viewing.imaging import retinal_scale
 
-SIZE, PITCH, DISTANCE, PLANES = 512, "3.74 um", "30 mm", 5
-FRAMES, STEPS, SIGMA, LIMIT = 8, 30, 0.66, 4 * math.pi
+PITCH, DISTANCE, PLANES = "3.74 um", "30 mm", 5
+SIGMA, LIMIT = 0.66, 4 * math.pi
 SEED = 7
 SOURCES = {None: "one wavelength", "sled": "SLED"}
 TRAINED = 5  # wavelengths of each SLED in the problem; the scores use 9 to 15, of which 3 are propagated
-CHECKED = 32  # random-phase holograms whose mean the wanted images are compared with
 
 
-def chain() -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
+@dataclass(frozen=True)
+class Amount:
+    """Size of the measurement."""
+
+    size: int = 512  # pixels along each side of the array
+    frames: int = 8
+    steps: int = 30
+    checked: int = 32  # random-phase holograms whose mean the wanted images are compared with
+
+
+FULL = Amount()
+QUICK = Amount(size=96, frames=2, steps=4, checked=4)
+
+
+def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
     """Table rows of the methods, further tables by name, PNG pictures by name, and lines of text."""
     warnings.simplefilter("ignore", SamplingWarning)  # of the collapsed method, whose error the verdict states
-    eye = _observer()
+    amount = QUICK if quick else FULL
+    eye = _observer(amount.size)
     foci = sorted(eye.scene.depths)[:: max(1, (PLANES - 1) // 2)]
     wavelengths, places = eye.scene.settings.wavelengths, [(eye.display, eye.eye(z)) for z in foci]
     retinas = [Retina(eye.scene.grid, wavelengths, *place, plane=z) for place, z in zip(places, foci, strict=True)]
@@ -46,12 +61,12 @@ def chain() -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[s
     spectral = [SpectralRetina(eye.scene.grid, spectra, *place, recompute=True) for place in places]
     crosstalk = ThermalCrosstalk(SIGMA)
     generator = torch.Generator().manual_seed(SEED)
-    fields = torch.stack([_random_field(eye, generator) for _ in range(FRAMES)])
+    fields = torch.stack([_random_field(eye, generator) for _ in range(amount.frames)])
     start = deconvolve(crosstalk, fields.angle() % (2 * math.pi) + math.pi)
     cost, largest = [], 0.0
     methods = {}
     for light, operator in ("one wavelength", views), ("SLED", RetinaViews(spectral)):
-        phase, numbers = _corrected(crosstalk, operator, wanted, start, light)
+        phase, numbers = _corrected(crosstalk, operator, wanted, start, light, amount.steps)
         cost.append(numbers)
         largest = max(largest, crosstalk(phase).max().item() / math.pi)
         methods[f"joint correction for {light}"] = phasor(crosstalk(phase))
@@ -63,7 +78,8 @@ def chain() -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[s
             numbers, images = _scores(eye, emitted, source, foci, views, wanted)
             rows.append({"method": name, "light": light} | numbers)
             shown[f"{name}, shown: {light}"] = images
-    text = _verdict(eye, rows, retinas, _deviation(eye, views, wanted), cost, largest)
+    deviation = _deviation(eye, views, wanted, amount.checked)
+    text = [_headline(rows), *_setup(eye, retinas, deviation, largest, amount), *_lines(rows, cost)]
     peak = wanted.amax()
     pixels = {name: tone_map(each.movedim(1, 0), peak=peak).movedim(0, 1) for name, each in shown.items()}
     short = {name.replace("joint correction ", "joint, "): each for name, each in pixels.items()}
@@ -72,30 +88,30 @@ def chain() -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[s
 
 
 def _corrected(
-    crosstalk: ThermalCrosstalk, views: RetinaViews, wanted: Tensor, start: Tensor, light: str
+    crosstalk: ThermalCrosstalk, views: RetinaViews, wanted: Tensor, start: Tensor, light: str, steps: int
 ) -> tuple[Tensor, dict[str, Any]]:
     """Heater phases [F, C, H, W] that show the wanted images under the light of ``views``, and what they cost."""
     problem = PECProblem(
         crosstalk, views, wanted, frames=True, amplitude=True, scale_free=True, limit=0.985 * LIMIT, limit_weight=1.0
     )
     begin = time.perf_counter()
-    with tqdm(total=STEPS, desc=f"chain, {light}", unit="step", dynamic_ncols=True) as bar:
+    with tqdm(total=steps, desc=f"chain, {light}", unit="step", dynamic_ncols=True) as bar:
 
         def step(solution: Solution) -> None:
             relative = (solution.losses[-1] / solution.losses[0]).mean().item()
             bar.set_postfix(loss=f"{relative:.2e}", mem=f"{peak_memory() / 1e9:.2f}GB")
             bar.update()
 
-        solver = LBFGS(max_steps=STEPS, precondition=spread_preconditioner(crosstalk.kernel), tolerance=0.0)
+        solver = LBFGS(max_steps=steps, precondition=spread_preconditioner(crosstalk.kernel), tolerance=0.0)
         phase = limit_peak_phase(LIMIT, solver(problem, start, callback=step).x, crosstalk)
     seconds = round(time.perf_counter() - begin, 1)
-    return phase, {"light": light, "steps": STEPS, "seconds": seconds, "peak_memory_bytes": peak_memory()}
+    return phase, {"light": light, "steps": steps, "seconds": seconds, "peak_memory_bytes": peak_memory()}
 
 
-def _observer() -> Observer:
+def _observer(size: int) -> Observer:
     paths = [find_config(f"configs/{kind}/teapot.yaml") for kind in ("eye", "volume")]
     assert paths[0] is not None and paths[1] is not None
-    shape = f"hologram={{shape: [{SIZE}, {SIZE}], pitch: {PITCH}, distance: {DISTANCE}, depths: {PLANES}}}"
+    shape = f"hologram={{shape: [{size}, {size}], pitch: {PITCH}, distance: {DISTANCE}, depths: {PLANES}}}"
     scene = load_config(paths[1], [shape, "device=cpu", *volume_file("teapot")])
     return observer(load_config(paths[0]), scene)
 
@@ -146,12 +162,12 @@ def _scaled(image: Tensor, scale: float) -> Tensor:
     return moved / scale**2
 
 
-def _deviation(eye: Observer, views: RetinaViews, wanted: Tensor) -> float:
+def _deviation(eye: Observer, views: RetinaViews, wanted: Tensor, checked: int) -> float:
     """Relative difference of the wanted images from the mean of random-phase holograms."""
     generator = torch.Generator().manual_seed(SEED + 1)
     total = torch.zeros_like(wanted)
     with torch.no_grad():
-        for _ in tqdm(range(CHECKED), desc="checking the wanted images", unit="hologram", dynamic_ncols=True):
+        for _ in tqdm(range(checked), desc="checking the wanted images", unit="hologram", dynamic_ncols=True):
             total += views(_random_field(eye, generator))
     total *= best_scale(total, wanted, -3)[:, None, None, None]
     return ((total - wanted).norm() / wanted.norm()).item()
@@ -183,17 +199,29 @@ def _scores(
     return {key: round(value, 4) for key, value in numbers.items()}, seen
 
 
-def _verdict(
-    eye: Observer, rows: list[dict], retinas: list[Retina], deviation: float, cost: list[dict], largest: float
-) -> list[str]:
+def _headline(rows: list[dict]) -> str:
+    shown = {row["method"]: row for row in rows if row["light"] == SOURCES["sled"]}
+    joint, ideal = shown["joint correction for SLED"], shown["ideal complex fields, random phases averaged"]
+    return (
+        f"shown by an SLED, the joint correction for it has SSIM {joint['ssim']:.3f} and {joint['psnr']:.1f} dB, ideal "
+        f"complex fields of random phases {ideal['ssim']:.3f} and {ideal['psnr']:.1f} dB"
+    )
+
+
+def _setup(eye: Observer, retinas: list[Retina], deviation: float, largest: float, amount: Amount) -> list[str]:
     scene = f" (synthetic: {eye.scene.synthetic})" if eye.scene.synthetic else ""
-    lines = [
-        f"Teapot{scene}, {SIZE} px of {PITCH}, {FRAMES} frames, eyepiece and eye of configs/eye/teapot.yaml, "
-        f"{len(retinas)} foci; sigma {SIGMA} px, largest phase {largest:.2f} pi",
-        f"Wanted: incoherent images in closed form; the mean of {CHECKED} random-phase holograms differs from them by "
-        f"{deviation:.3f} (1 / sqrt({CHECKED}) is {CHECKED**-0.5:.3f})",
+    checked = amount.checked
+    return [
+        f"Teapot{scene}, {amount.size} px of {PITCH}, {amount.frames} frames, eyepiece and eye of "
+        f"configs/eye/teapot.yaml, {len(retinas)} foci; sigma {SIGMA} px, largest phase {largest:.2f} pi",
+        f"Wanted: incoherent images in closed form; the mean of {checked} random-phase holograms differs from them by "
+        f"{deviation:.3f} (1 / sqrt({checked}) is {checked**-0.5:.3f})",
         f"Predicted error of the collapsed propagation: {max(each.plan.predicted_error for each in retinas):.2f}",
     ]
+
+
+def _lines(rows: list[dict], cost: list[dict]) -> list[str]:
+    lines = []
     for each in cost:
         lines.append(
             f"{each['steps']} steps for {each['light']} in {each['seconds']:.0f} s; at most "

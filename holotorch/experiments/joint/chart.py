@@ -8,7 +8,7 @@ import os
 import statistics
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,12 @@ from holotorch.experiments.joint.experiment import JointExperiment, build
 from holotorch.experiments.joint.methods import Shown, baseline, show
 from holotorch.experiments.joint.names import NAMES
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.runs.figures import figure_png
+from holotorch.experiments.runs.figures import figure_png, mark_choice, pareto_front
 from holotorch.io.bundled import find_config
 
 VOLUMES = "HOLOTORCH_VOLUMES"  # variable that names a folder with the two volumes
-SCENES = ("teapot", "bonsai")
 FILES = {"teapot": "boston_teapot.nrrd", "bonsai": "bonsai.nrrd"}
-SEEDS = (7, 8, 9)
-SIZE = 128
-STEPS = 100
-BUDGETS = (5, 10, 20, 40, 80, 160)  # steps of the chart of speed against accuracy
-BITS = (4, 6, 8)  # of the heaters
-LIGHT = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)  # weights of the light that misses the pupil
-WRONG = (0.01, 0.05, 0.1)  # relative errors of sigma in the model
+DEFAULT_STEPS = 60  # of a configuration that does not state another number
 
 # What each case changes in the configuration, and the methods besides the joint correction.
 CASES: dict[str, tuple[list[str], tuple[str, ...]]] = {
@@ -49,39 +42,76 @@ CASES: dict[str, tuple[list[str], tuple[str, ...]]] = {
 MEMORY = "heat={frame_us: 20, time_constant_us: 10}"  # a time constant of half a frame
 
 
-def joint() -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
+@dataclass(frozen=True)
+class Amount:
+    """Size of the measurement."""
+
+    scenes: tuple[str, ...] = ("teapot", "bonsai")
+    seeds: tuple[int, ...] = (7, 8, 9)
+    cases: tuple[str, ...] = tuple(CASES)
+    size: int = 128  # pixels along each side of the array
+    steps: int = 100
+    frames: tuple[int, ...] = (8, 24)  # of the chart of speed against accuracy
+    budgets: tuple[int, ...] = (5, 10, 20, 40, DEFAULT_STEPS, 80, 160)  # steps of that chart
+    bits: tuple[int, ...] = (4, 6, 8)  # of the heaters
+    light: tuple[float, ...] = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)  # weights of the light that misses the pupil
+    wrong: tuple[float, ...] = (0.01, 0.05, 0.1)  # relative errors of sigma in the model
+
+
+FULL = Amount()
+QUICK = Amount(
+    scenes=("teapot",),
+    seeds=(7,),
+    cases=("8 frames", "8 frames, parallax"),
+    size=64,
+    steps=15,
+    frames=(8,),
+    budgets=(5, 10, 20),
+    bits=(6,),
+    light=(0.0, 0.03),
+    wrong=(0.05,),
+)
+
+
+def joint(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
     """Table rows of all cases, further tables by name, PNG figures by name, and lines of text."""
+    amount = QUICK if quick else FULL
+    cases = {name: CASES[name] for name in amount.cases}
     rows: list[dict[str, Any]] = []
     memory: list[dict[str, Any]] = []
     synthetic = ""
-    with tqdm(total=len(SCENES) * len(SEEDS) * (len(CASES) + 1), desc="joint", unit="case", dynamic_ncols=True) as bar:
-        for scene in SCENES:
-            for seed in SEEDS:
-                for case, (changes, methods) in CASES.items():
-                    experiment = _experiment(scene, seed, changes)
+    total = len(amount.scenes) * len(amount.seeds) * (len(cases) + 1)
+    with tqdm(total=total, desc="joint", unit="case", dynamic_ncols=True) as bar:
+        for scene in amount.scenes:
+            for seed in amount.seeds:
+                for case, (changes, methods) in cases.items():
+                    experiment = _experiment(scene, seed, changes, amount)
                     synthetic = synthetic or experiment.scene.synthetic
                     rows += [{"scene": scene, "seed": seed, "case": case} | row for row in _case(experiment, methods)]
                     bar.update()
-                memory += [{"scene": scene, "seed": seed} | row for row in _with_memory(scene, seed)]
+                memory += [{"scene": scene, "seed": seed} | row for row in _with_memory(scene, seed, amount)]
                 bar.update()
-    speed = list(_speed())
-    device = list(_device())
-    text = [f"Synthetic volumes: {synthetic}"] if synthetic else []
-    text += _verdict(rows, memory)
-    light = list(_light())
+    speed, device, light = list(_speed(amount)), list(_device(amount)), list(_light(amount))
+    text = _verdict(rows, memory, amount)
+    text[1:1] = [f"Synthetic volumes: {synthetic}"] if synthetic else []
     tables = {"memory": memory, "speed": speed, "device": device, "light": light}
-    return rows, tables, {"chart": _draw(rows, speed, light)}, text
+    return rows, tables, {"chart": _draw(rows, speed, light, amount)}, text
 
 
-def _experiment(scene: str, seed: int, changes: list[str]) -> JointExperiment:
+def _experiment(scene: str, seed: int, changes: list[str], amount: Amount) -> JointExperiment:
     """The bundled configuration for one wavelength, without files where a folder of volumes is not given."""
     path = find_config(f"configs/joint/{scene}.yaml")
     assert path is not None
-    words = ["wavelengths=[520 nm]", f"seed={seed}", f"steps={STEPS}", f"display.shape=[{SIZE},{SIZE}]"]
-    words += ["eye.parallax=0", *changes]
+    words = ["wavelengths=[520 nm]", f"seed={seed}", f"steps={amount.steps}"]
+    words += [f"display.shape=[{amount.size},{amount.size}]", "eye.parallax=0", *changes]
     settings = load_config(path, words + volume_file(scene))
     assert isinstance(settings, JointSettings)
     return build(settings)
+
+
+def _first(amount: Amount, *changes: str) -> JointExperiment:
+    """The experiment of the first scene and seed."""
+    return _experiment(amount.scenes[0], amount.seeds[0], list(changes), amount)
 
 
 def volume_file(scene: str) -> list[str]:
@@ -110,9 +140,9 @@ def _row(experiment: JointExperiment, method: str, shown: Shown, begin: float) -
     return {"method": method, **{key: round(value, 4) for key, value in numbers.items()}, "seconds": round(seconds, 2)}
 
 
-def _with_memory(scene: str, seed: int) -> Iterator[dict[str, Any]]:
+def _with_memory(scene: str, seed: int, amount: Amount) -> Iterator[dict[str, Any]]:
     """Heat that is left from earlier frames: corrected frame by frame, and as a cycle."""
-    cold, warm = _experiment(scene, seed, []), _experiment(scene, seed, [MEMORY])
+    cold, warm = (_experiment(scene, seed, changes, amount) for changes in ([], [MEMORY]))
     begin = time.perf_counter()
     phase = cold.solve().x
     yield _row(cold, "no heat is left", show(cold, phase), begin)
@@ -121,12 +151,12 @@ def _with_memory(scene: str, seed: int) -> Iterator[dict[str, Any]]:
     yield _row(warm, "heat is left, cycle corrected", show(warm, warm.solve().x), begin)
 
 
-def _speed() -> Iterator[dict[str, Any]]:
+def _speed(amount: Amount) -> Iterator[dict[str, Any]]:
     """Accuracy by time of the solver, for the first scene and seed."""
-    for frames in (8, 24):
-        experiment = _experiment(SCENES[0], SEEDS[0], [f"frames={frames}"])
+    for frames in amount.frames:
+        experiment = _first(amount, f"frames={frames}")
         _ = experiment.trained
-        for steps in BUDGETS:
+        for steps in amount.budgets:
             budget = replace(experiment, settings=experiment.settings.model_copy(update={"steps": steps}))
             begin = time.perf_counter()
             phase = budget.solve().x
@@ -137,35 +167,36 @@ def _speed() -> Iterator[dict[str, Any]]:
             yield {"frames": frames, "steps": ""} | _row(experiment, name, baseline(experiment, name), begin)
 
 
-def _device() -> Iterator[dict[str, Any]]:
+def _device(amount: Amount) -> Iterator[dict[str, Any]]:
     """What coarse heaters and a wrong model of the heat cost, for the first scene and seed."""
-    experiment = _experiment(SCENES[0], SEEDS[0], [])
+    experiment = _first(amount)
     phase = show(experiment, experiment.solve().x).phase
     assert phase is not None
     yield {"case": "as modelled"} | _row(experiment, "joint", show(experiment, phase), time.perf_counter())
-    for bits in BITS:
+    for bits in amount.bits:
         level = phase.max() / (2**bits - 1)
         rounded = (phase / level).round() * level
         yield {"case": f"{bits} bits"} | _row(experiment, "joint", show(experiment, rounded), time.perf_counter())
-    for wrong in WRONG:
+    for wrong in amount.wrong:
         sigma = experiment.settings.display.sigma_px * (1 + wrong)
-        other = _experiment(SCENES[0], SEEDS[0], [f"display.sigma_px={sigma}"])
+        other = _first(amount, f"display.sigma_px={sigma}")
         yield {"case": f"sigma {wrong:.0%} larger"} | _row(other, "joint", show(other, phase), time.perf_counter())
 
 
-def _light() -> Iterator[dict[str, Any]]:
+def _light(amount: Amount) -> Iterator[dict[str, Any]]:
     """What more light in the pupil costs, for the first scene and seed."""
-    for weight in LIGHT:
-        experiment = _experiment(SCENES[0], SEEDS[0], [f"light_weight={weight}"])
+    for weight in amount.light:
+        experiment = _first(amount, f"light_weight={weight}")
         begin = time.perf_counter()
         yield {"weight": weight} | _row(experiment, "joint", show(experiment, experiment.solve().x), begin)
 
 
-def _verdict(rows: list[dict[str, Any]], memory: list[dict[str, Any]]) -> list[str]:
-    lines = [f"One colour (520 nm), {SIZE} px, {STEPS} steps; mean (worst) of {len(SEEDS)} seeds; PSNR of intensity:"]
-    for scene in SCENES:
-        for case, (_, methods) in CASES.items():
-            for method in ("joint", *methods):
+def _verdict(rows: list[dict[str, Any]], memory: list[dict[str, Any]], amount: Amount) -> list[str]:
+    setup = f"One colour (520 nm), {amount.size} px, {amount.steps} steps; mean (worst) of {len(amount.seeds)} seed(s)"
+    lines = []
+    for scene in amount.scenes:
+        for case in amount.cases:
+            for method in ("joint", *CASES[case][1]):
                 chosen = [row for row in rows if (row["scene"], row["case"], row["method"]) == (scene, case, method)]
                 words = [f"stack {_spread(chosen, 'stack_psnr')} dB, SSIM {_spread(chosen, 'stack_ssim', 4)}"]
                 words.append(f"contrast {statistics.mean(row['stack_contrast'] for row in chosen):.3f}")
@@ -178,7 +209,7 @@ def _verdict(rows: list[dict[str, Any]], memory: list[dict[str, Any]]) -> list[s
         for method in dict.fromkeys(row["method"] for row in memory):
             chosen = [row for row in memory if (row["scene"], row["method"]) == (scene, method)]
             lines.append(f"{scene}, {method} (time constant of half a frame): stack {_spread(chosen, 'stack_psnr')} dB")
-    return lines
+    return [lines[0], f"{setup}; PSNR of intensity:", *lines[1:]]
 
 
 def _spread(rows: list[dict[str, Any]], key: str, digits: int = 1) -> str:
@@ -186,11 +217,14 @@ def _spread(rows: list[dict[str, Any]], key: str, digits: int = 1) -> str:
     return f"{statistics.mean(values):.{digits}f} ({min(values):.{digits}f})"
 
 
-def _draw(rows: list[dict[str, Any]], speed: list[dict[str, Any]], light: list[dict[str, Any]]) -> bytes:
+def _draw(
+    rows: list[dict[str, Any]], speed: list[dict[str, Any]], light: list[dict[str, Any]], amount: Amount
+) -> bytes:
     """Accuracy against time, and what parallax and light in the pupil cost."""
+    scenes = amount.scenes
     figure = Figure(figsize=(14, 4.2), layout="constrained")
     left, right, last = figure.subplots(1, 3)
-    for frames, colour in ((8, "#2867b2"), (24, "#c0392b")):
+    for frames, colour in zip(amount.frames, ("#2867b2", "#c0392b"), strict=False):
         curve = [row for row in speed if row["frames"] == frames and row["method"] == "joint"]
         left.semilogx(
             [row["seconds"] for row in curve],
@@ -204,9 +238,16 @@ def _draw(rows: list[dict[str, Any]], speed: list[dict[str, Any]], light: list[d
                 marker = {"random": "s", "slabs": "^"}[row["method"]]
                 label = f"{NAMES[row['method']]}, {frames} frames"
                 left.semilogx(max(row["seconds"], 1e-2), row["stack_psnr"], marker, color=colour, label=label)
-    left.set(xlabel="seconds on two cores", ylabel="PSNR of the focal stack (dB)", title=f"{SCENES[0]}, {SIZE} px")
-    for scene, marker in zip(SCENES, "os", strict=False):
-        for case in (case for case in CASES if "sigma" not in case and "limit" not in case):
+    # The front is of the fastest and the most accurate, and a larger PSNR is more accurate.
+    front = pareto_front((max(row["seconds"], 1e-2), -row["stack_psnr"]) for row in speed)
+    steps = [(seconds, -negative) for seconds, negative in front]
+    left.step(*zip(*steps, strict=True), where="post", color="0.6", linewidth=1, zorder=0, label="Pareto front")
+    default = [(row["seconds"], row["stack_psnr"]) for row in speed if row["steps"] == DEFAULT_STEPS]
+    if default:
+        mark_choice(left, default, "default steps")
+    left.set(xlabel="seconds", ylabel="PSNR of the focal stack (dB)", title=f"{scenes[0]}, {amount.size} px")
+    for scene, marker in zip(scenes, "os", strict=False):
+        for case in (case for case in amount.cases if "sigma" not in case and "limit" not in case):
             chosen = [r for r in rows if (r["scene"], r["case"], r["method"]) == (scene, case, "joint")]
             x, y = (statistics.mean(row[key] for row in chosen) for key in ("stack_psnr", "half_psnr"))
             right.plot(x, y, marker, color="#c0392b" if "24" in case else "#2867b2", fillstyle=_fill(case))
@@ -216,7 +257,7 @@ def _draw(rows: list[dict[str, Any]], speed: list[dict[str, Any]], light: list[d
     for row in light:
         place = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 6}
         last.annotate(f"weight {row['weight']:g}", (row["light_in_pupil"], row["stack_psnr"]), **place)
-    last.set(xlabel="fraction of the light in pupil and window", title=f"Light costs; {SCENES[0]}, 8 frames")
+    last.set(xlabel="fraction of the light in pupil and window", title=f"Light costs; {scenes[0]}, 8 frames")
     for axes in (left, right, last):
         axes.grid(alpha=0.3)
     left.legend(fontsize=6)

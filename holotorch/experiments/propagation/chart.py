@@ -4,6 +4,7 @@ import math
 import platform
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
 from typing import Any
@@ -18,7 +19,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import fft2, filter_spectrum, ifft2
 from holotorch.core.grid import Grid
-from holotorch.experiments.runs.figures import figure_png
+from holotorch.experiments.runs.figures import draw_front, figure_png, mark_choice
 from holotorch.experiments.timing import interleaved
 from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel, Propagator, unaliased_distance
 from holotorch.optics.free_space.plane_pair import PlanePair
@@ -27,25 +28,39 @@ from holotorch.optics.planning.content import FieldContent
 from holotorch.optics.planning.propagate import kernel_of
 
 WAVELENGTH = 530e-9  # metres
-DISTANCES = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)  # metres
-# Test grids: pixels along each side, and pitch in metres.
-CASES = ((256, 8e-6), (512, 8e-6), (1024, 8e-6), (2048, 8e-6), (256, 3.74e-6), (512, 3.74e-6), (1024, 3.74e-6))
-SHOWN = (512, 8e-6)  # the grid whose error is drawn against time
-LARGE = 2000  # pixels along a side from which only FEW_DISTANCES are measured
-FEW_DISTANCES = (5e-3, 60e-3, 2.0)  # metres
 PEER_LIMIT = 512  # pixels along a side up to which torchoptics is measured; larger grids take minutes
 SOURCES = ("smooth", "slm", "white", "hard edge")  # test fields, see ``source``
-PREDICTION_CASES = 40  # number of random cases that test the predicted errors
 TOLERANCE = 1e-3  # allowed relative L2 error of the planned method
+PLANNED = "planned, tolerance 1e-3"
+BARE = "bare FFTs, pad 2, float32 kernel"
 
 
-def propagation() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
+@dataclass(frozen=True)
+class Amount:
+    """Size of the measurement; the grids are pixels along each side, and pitch in metres."""
+
+    cases: tuple[tuple[int, float], ...] = (
+        (256, 8e-6), (512, 8e-6), (1024, 8e-6), (2048, 8e-6), (256, 3.74e-6), (512, 3.74e-6), (1024, 3.74e-6)
+    )  # fmt: skip
+    distances: tuple[float, ...] = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)  # metres
+    shown: tuple[int, float] = (512, 8e-6)  # the grid whose error is drawn against time
+    large: int = 2000  # pixels along a side from which only ``few_distances`` are measured
+    few_distances: tuple[float, ...] = (5e-3, 60e-3, 2.0)  # metres
+    predictions: int = 40  # number of random cases that test the predicted errors
+
+
+FULL = Amount()
+QUICK = Amount(cases=((256, 8e-6), (256, 3.74e-6)), distances=(5e-3, 60e-3, 2.0), shown=(256, 8e-6), predictions=6)
+
+
+def propagation(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     """Table rows of the chart, table rows of the test of predictions, PNG pictures by name, and lines of text."""
+    amount = QUICK if quick else FULL
     with warnings.catch_warnings(action="ignore", category=SamplingWarning):
-        rows = [row for size, pitch in CASES for row in _measure(size, pitch)]
-        prediction = _predictions()
-    pictures = {"chart": _draw(rows), "validity": _draw_validity(rows)}
-    return rows, prediction, pictures, _verdict(rows, prediction)
+        rows = [row for size, pitch in amount.cases for row in _measure(size, pitch, amount)]
+        prediction = _predictions(amount.predictions)
+    pictures = {"chart": _draw(rows, amount), "validity": _draw_validity(rows, amount)}
+    return rows, prediction, pictures, _verdict(rows, prediction, amount)
 
 
 def source(kind: str, grid: Grid) -> Tensor:
@@ -71,18 +86,18 @@ def source(kind: str, grid: Grid) -> Tensor:
     return phasor(2 * math.pi * random)
 
 
-def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
+def _measure(size: int, pitch: float, amount: Amount) -> list[dict[str, Any]]:
     """Table rows of every method, source and distance on one grid; ``pitch`` in metres."""
     grid, wide, rows = Grid(size, pitch), Grid(2 * size, pitch), []
     fields = {kind: source(kind, grid) for kind in SOURCES}
-    distances = [z for z in DISTANCES if size < LARGE or z in FEW_DISTANCES]
+    distances = amount.distances if size < amount.large else amount.few_distances
     for distance in tqdm(distances, desc=f"{size} px, {pitch * 1e6:g} um", unit="distance"):
         reference = CroppedKernel(wide, WAVELENGTH, distance)
         exact = {kind: _exact(reference, field) for kind, field in fields.items()}
         methods = _methods(grid, distance)
         dtypes = {name: torch.complex128 if "complex128" in name else torch.complex64 for name in methods}
         calls = {name: partial(call, fields["white"].to(dtypes[name])) for name, call in methods.items()}
-        seconds = interleaved(calls, rounds=5 if size < LARGE else 3)
+        seconds = interleaved(calls, rounds=5 if size < amount.large else 3)
         for name, call in methods.items():
             for kind, field in fields.items():
                 rows.append(
@@ -95,7 +110,7 @@ def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
                         "method": name,
                         "error": _error(call(field.to(dtypes[name])), exact[kind]),
                         "seconds": f"{seconds[name]:.3e}",
-                        "ratio_to_bare": round(seconds[name] / seconds["bare FFTs, pad 2, float32 kernel"], 3),
+                        "ratio_to_bare": round(seconds[name] / seconds[BARE], 3),
                     }
                 )
     return rows
@@ -128,13 +143,13 @@ def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor
 
     setup = grid, WAVELENGTH, distance
     modules: dict[str, torch.nn.Module] = {
-        "planned, tolerance 1e-3": Propagator(*setup, tolerance=TOLERANCE),
+        PLANNED: Propagator(*setup, tolerance=TOLERANCE),
         "planned, 1e-3, complex128": Propagator(*setup, tolerance=TOLERANCE),
         "cropped kernel": CroppedKernel(*setup),
         **{f"angular spectrum, pad {pad:g}": AngularSpectrum(*setup, pad=pad) for pad in (1.125, 2.0, 4.0)},
         "Fresnel, pad 2": Fresnel(*setup, pad=2),
     }
-    calls: dict[str, Callable[[Tensor], Tensor]] = {"bare FFTs, pad 2, float32 kernel": bare}
+    calls: dict[str, Callable[[Tensor], Tensor]] = {BARE: bare}
     calls |= {name: (lambda field, m=module: m(field[None])[0]) for name, module in modules.items()}
     if max(grid.shape) > PEER_LIMIT:
         return calls
@@ -149,10 +164,10 @@ def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor
     return calls | {"torchoptics, automatic": peer}
 
 
-def _predictions() -> list[dict[str, Any]]:
+def _predictions(cases: int) -> list[dict[str, Any]]:
     """True and predicted error of every method for band-limited noise; grid, distance and band are random."""
     generator, rows = np.random.default_rng(11), []
-    for case in tqdm(range(PREDICTION_CASES), desc="predictions", unit="case"):
+    for case in tqdm(range(cases), desc="predictions", unit="case"):
         pitch, share = float(generator.choice([3.74e-6, 8e-6])), float(generator.uniform(0.2, 1.0))
         grid = Grid((int(generator.integers(40, 120)), int(generator.integers(40, 120))), pitch)
         wavelength = float(generator.choice([450e-9, 530e-9, 636e-9]))
@@ -185,56 +200,61 @@ def _noise(grid: Grid, share: float, seed: int) -> Tensor:
     return ifft2(spectrum, grid.shape)
 
 
-def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
-    lines = [
-        f"torch {torch.__version__}, {torch.get_num_threads()} threads, {platform.machine()}, complex64; errors "
-        "against the cropped kernel in complex128 on twice the window"
-    ]
-    for name in dict.fromkeys(row["method"] for row in rows):
+def _verdict(rows: list[dict], prediction: list[dict], amount: Amount) -> list[str]:
+    lines = []
+    for name in sorted(dict.fromkeys(row["method"] for row in rows), key=lambda name: name != PLANNED):
         selected = [row for row in rows if row["method"] == name]
         worst = {kind: max(float(row["error"]) for row in selected if row["source"] == kind) for kind in SOURCES}
         errors = ", ".join(f"{kind} {error:.0e}" for kind, error in worst.items())
         ratio = np.median([row["ratio_to_bare"] for row in selected])
         lines.append(f"{name}: worst error {errors}; median time {ratio:.2f} of bare FFTs")
+    lines.insert(
+        1,
+        f"torch {torch.__version__}, {torch.get_num_threads()} threads, {platform.machine()}, complex64; errors "
+        "against the cropped kernel in complex128 on twice the window",
+    )
     peers = [row for row in rows if row["method"].startswith("torchoptics") and row["source"] == "white"]
     if peers:
         case = itemgetter("size_px", "pitch_um", "distance_m")
-        planned = {case(row): row["ratio_to_bare"] for row in rows if row["method"].startswith("planned, tol")}
+        planned = {case(row): row["ratio_to_bare"] for row in rows if row["method"] == PLANNED}
         ratios = [row["ratio_to_bare"] / planned[case(row)] for row in peers]
-        at_512 = [ratio for row, ratio in zip(peers, ratios, strict=True) if row["size_px"] == SHOWN[0]]
+        size = amount.shown[0]
+        at_size = [ratio for row, ratio in zip(peers, ratios, strict=True) if row["size_px"] == size]
         lines.append(
             f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned method, at "
-            f"{SHOWN[0]} px at least {min(at_512):.1f} times"
+            f"{size} px at least {min(at_size):.1f} times"
         )
     checked = [row for row in prediction if 1e-6 < float(row["predicted"]) < 0.05]
     factors = [float(row["true"]) / float(row["predicted"]) for row in checked]
     optimal = 0
-    for number in range(PREDICTION_CASES):
+    for number in range(amount.predictions):
         methods = [row for row in prediction if row["case"] == number]
         adequate = [float(row["flops"]) for row in methods if float(row["true"]) <= TOLERANCE]
         chosen = [float(row["flops"]) for row in methods if float(row["predicted"]) <= TOLERANCE]
         optimal += min(chosen) <= min(adequate) * 1.001
     lines.append(
         f"predicted error: true / predicted from {min(factors):.2f} to {max(factors):.2f} over {len(factors)} cases; "
-        f"the cheapest adequate method chosen in {optimal} of {PREDICTION_CASES}"
+        f"the cheapest adequate method chosen in {optimal} of {amount.predictions}"
     )
     return lines
 
 
-def _draw(rows: list[dict]) -> bytes:
-    """PNG of error against time, one panel for each source and distance, at 512 px and 8 um."""
-    size, pitch = SHOWN
+def _draw(rows: list[dict], amount: Amount) -> bytes:
+    """PNG of error against time, one panel for each source and distance, on one grid."""
+    size, pitch = amount.shown
     shown = [row for row in rows if row["size_px"] == size and row["pitch_um"] == pitch * 1e6]
     names = list(dict.fromkeys(row["method"] for row in shown))
-    figure = Figure(figsize=(3.2 * len(DISTANCES), 2.6 * len(SOURCES)), layout="constrained")
-    panels = figure.subplots(len(SOURCES), len(DISTANCES), sharex=True, sharey=True)
+    figure = Figure(figsize=(3.2 * len(amount.distances), 2.6 * len(SOURCES)), layout="constrained")
+    panels = figure.subplots(len(SOURCES), len(amount.distances), sharex=True, sharey=True)
     for i, kind in enumerate(SOURCES):
-        for j, distance in enumerate(DISTANCES):
+        for j, distance in enumerate(amount.distances):
             axes = panels[i][j]
+            selected = [row for row in shown if (row["source"], row["distance_m"]) == (kind, distance)]
+            points = {row["method"]: (row["ratio_to_bare"], _in_range(row["error"])) for row in selected}
             for k, name in enumerate(names):
-                row = next(r for r in shown if (r["source"], r["distance_m"], r["method"]) == (kind, distance, name))
-                error = min(max(float(row["error"]), 1e-8), 10)
-                axes.loglog(row["ratio_to_bare"], error, "os^vD*PhX"[k % 9], color=f"C{k}", label=name, markersize=8)
+                axes.loglog(*points[name], "os^vD*PhX"[k % 9], color=f"C{k}", label=name, markersize=8)
+            draw_front(axes, points.values())
+            mark_choice(axes, [points[PLANNED]])
             crossovers = distance / unaliased_distance(Grid(size, pitch), WAVELENGTH, 2)
             axes.set_title(f"{kind}, {distance * 1e3:g} mm = {crossovers:.2g} z_c", fontsize=9)
             axes.grid(alpha=0.3)
@@ -244,7 +264,12 @@ def _draw(rows: list[dict]) -> bytes:
     return _with_legend(figure, panels[0][0])
 
 
-def _draw_validity(rows: list[dict]) -> bytes:
+def _in_range(error: str) -> float:
+    """An error within the range that the figure shows."""
+    return min(max(float(error), 1e-8), 10)
+
+
+def _draw_validity(rows: list[dict], amount: Amount) -> bytes:
     """PNG of error against distance / cross-over distance; bars at the top mark where a method becomes inaccurate."""
     names = list(dict.fromkeys(row["method"] for row in rows))
     figure = Figure(figsize=(11, 4.6), layout="constrained")
@@ -254,11 +279,11 @@ def _draw_validity(rows: list[dict]) -> bytes:
             chosen = [row for row in rows if row["method"] == name and row["source"] == kind]
             points = sorted((row["crossovers"], min(float(row["error"]), 10)) for row in chosen)
             axes.loglog(*zip(*points, strict=True), "os^vD*PhX"[k % 9], color=f"C{k}", label=name, alpha=0.8)
-            for border in _borders(name):
+            for border in _borders(name, amount):
                 axes.axvline(border, ymin=0.9, color=f"C{k}", linewidth=2)
         axes.axvline(1, color="k", linestyle=":", linewidth=1)
         axes.axhline(TOLERANCE, color="k", linestyle=":", linewidth=1)
-        axes.set_title(f"{kind} source, {len(CASES)} grids")
+        axes.set_title(f"{kind} source, {len(amount.cases)} grids")
         axes.set(xlabel="distance / cross-over distance z_c = 2 L pitch / wavelength", ylabel="relative L2 error")
         axes.grid(alpha=0.3)
     return _with_legend(figure, panels[0])
@@ -269,7 +294,7 @@ def _with_legend(figure: Figure, axes: Any) -> bytes:
     return figure_png(figure)
 
 
-def _borders(name: str) -> list[float]:
+def _borders(name: str, amount: Amount) -> list[float]:
     """Distances at which a method becomes inaccurate in theory, divided by the cross-over distance z_c of each grid.
 
     Padding by a factor P suffices up to (P - 1) z_c. Other methods are inaccurate once the error of the phase reaches
@@ -278,7 +303,7 @@ def _borders(name: str) -> list[float]:
     """
     if name.startswith("angular spectrum"):
         return [float(name.split()[-1]) - 1]
-    grids = [Grid(size, pitch) for size, pitch in CASES]
+    grids = [Grid(size, pitch) for size, pitch in amount.cases]
     if name.startswith("bare"):
         distances = [TOLERANCE / 6e-8 * WAVELENGTH / (2 * math.pi)] * len(grids)
     elif name.startswith("Fresnel"):

@@ -2,10 +2,11 @@
 
 import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -156,6 +157,26 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
     return figure_png(figure)
+
+
+def pareto_front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those of the points (time, error) that no other point beats in both, from the fastest to the most accurate."""
+    front: list[tuple[float, float]] = []
+    for seconds, error in sorted(points):
+        if not front or error < front[-1][1]:
+            front.append((seconds, error))
+    return front
+
+
+def draw_front(axes: Axes, points: Iterable[tuple[float, float]], label: str = "Pareto front") -> None:
+    """Grey steps through the Pareto front of points (time, error), behind the points themselves."""
+    axes.step(*zip(*pareto_front(points), strict=True), where="post", color="0.6", linewidth=1, zorder=0, label=label)
+
+
+def mark_choice(axes: Axes, points: Iterable[tuple[float, float]], label: str = "automatic choice") -> None:
+    """A black ring around each point (time, error) of what is chosen unless the user states another."""
+    style = {"markersize": 14, "markerfacecolor": "none", "markeredgecolor": "black", "zorder": 1}
+    axes.plot(*zip(*points, strict=True), "o", label=label, **style)
 
 
 def figure_png(figure: Figure) -> bytes:

@@ -43,6 +43,16 @@ def figure(source: str, caption: str, kind: str) -> str:
     return render("figure", source, caption, kind)
 
 
+def fold(summary: str, lines: Sequence[str]) -> str:
+    """Paragraphs that the reader opens by a click on ``summary``."""
+    return render("fold", summary, lines)
+
+
+def addresses(files: dict[str, str]) -> str:
+    """Links in a row; ``files`` maps their text to addresses relative to the page."""
+    return render("addresses", files)
+
+
 def table(names: Sequence[str], rows: Sequence[Sequence[str]], *, head: bool = True) -> str:
     """A table of text. Columns that are empty in every row are left out, and so are the names if ``head`` is False."""
     kept = [i for i in range(len(names)) if any(row[i] for row in rows)]

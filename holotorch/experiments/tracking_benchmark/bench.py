@@ -52,11 +52,17 @@ _FITTING: dict[str, set[Status]] = {
 }
 
 
-def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
-    """Stability, bias, coverage and efficiency for catheters at rest, ``count`` frames at each pose of ``STILL``.
+def still(
+    world: World,
+    trackers: dict[str, Method],
+    count: int,
+    resting: Iterable[tuple[str, tuple[int, int]]] | None = None,
+) -> tuple[list[Row], list[Answer]]:
+    """Stability, bias, coverage and efficiency for catheters at rest, ``count`` frames at each of ``resting``.
 
-    Each pose is measured twice: with the tip at the given distance, and with the middle of the bands at that distance.
-    The middle of the bands appears at the centre of the frame in both cases.
+    These are a point of ``POINTS`` and a pose of ``STILL`` each. By default each pose is measured twice: with the tip
+    at the given distance, and with the middle of the bands at that distance. The middle of the bands appears at the
+    centre of the frame in both cases.
 
     Each pose is measured at five positions less than a pixel apart. S_RMS and the standard deviation are root mean
     squares over these positions, since their values vary by 10 % or more with the subpixel position of the edges.
@@ -65,7 +71,8 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     pixel = 1 / float(world.camera.matrix[0, 0])
     generator = torch.Generator().manual_seed(world.seed)
     offsets = (pixel * (torch.rand(_POSITIONS, 2, generator=generator) - 0.5)).tolist()
-    for (where, point), ((depth, tilt), goal) in product(POINTS.items(), STILL.items()):
+    for where, (depth, tilt) in product(POINTS, STILL) if resting is None else resting:
+        point, goal = POINTS[where], STILL[depth, tilt]
         pose = (1e-3 * depth, math.radians(tilt))
         bounds = tip_bounds(world, world.pose(*pose, point=point))
         bound, edges_bound = (1e3 * math.sqrt(covariance.trace()) for covariance in bounds)

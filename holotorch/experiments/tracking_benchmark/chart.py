@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,10 +31,15 @@ class Amount(NamedTuple):
     varied: int = 1104  # scenes of the second world with the catheter
     lookalikes: int = 1160  # scenes of the second world without it
     placed: int = 4  # poses of the catheter in each photograph of a calibration board
+    resting: tuple[tuple[str, tuple[int, int]], ...] | None = None  # points and poses of the catheters at rest; all
+    stream: int = 6  # different frames of each kind whose times are measured
+    repeats: int = 9  # repetitions of a call whose time is compared with the median frame's
     share: float = 1.0  # share of the grids, conditions, occlusions, and of the frames whose times are compared
 
 
-AMOUNT = Amount()
+FULL = Amount()
+_RESTING = ((TIP, (520, 20)),)
+QUICK = Amount(4, 1, 1, 5, 1, varied=1, lookalikes=1, placed=1, resting=_RESTING, stream=1, repeats=1, share=0.06)
 _PLAIN, _ALL = "plain desk", "all with a catheter but at rest"
 
 
@@ -45,32 +51,38 @@ def scene(folder: Path | None = None) -> World:
 def tracking(
     photographs_folder: Path | None = None,
     boards_folder: Path | None = None,
+    *,
+    quick: bool = False,
 ) -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[str]]:
-    """Measure all trackers; this takes about an hour and a half on two cores.
+    """Measure all trackers; this takes about an hour and a half on two cores, or seconds on few frames.
 
     Args:
         photographs_folder: Folder with photographs for backgrounds; without it, those of scikit-image.
         boards_folder: Folder with the calibration photographs of scikit-surgerybard and OpenCV, into which the catheter
             is rendered; without it, into one drawn board.
+        quick: Few frames of each kind, and no comparison with the goals.
 
     Returns:
         Rows of the methods, further tables by name, pictures by name, and lines of text that compare the results with
         the goals.
     """
-    world, amount = scene(photographs_folder), AMOUNT
+    amount = QUICK if quick else FULL
+    world = scene(photographs_folder)
     trackers = methods.methods(world, (BASE, COLD, PRIOR, FEWER))
     two, three = ({name: trackers[name] for name in names} for names in ((BASE, COLD), (BASE, COLD, PRIOR)))
-    tables: dict[str, list[Row]] = {"times": timing(world, amount.rounds), "stages": stages(world, amount.rounds)}
-    tables["slowest"] = spread(world, amount.seeds, amount.share)
+    tables: dict[str, list[Row]] = {"times": timing(world, amount.rounds, amount.stream)}
+    tables["stages"] = stages(world, amount.rounds)
+    tables["slowest"] = spread(world, amount.seeds, amount.share, amount.repeats)
     answers: dict[str, list[Answer]] = {}
-    tables["still"], answers["still"] = bench.still(world, trackers, amount.still)
+    tables["still"], answers["still"] = bench.still(world, trackers, amount.still, amount.resting)
     tables["grids"], answers["grids"] = bench.grids(world, trackers, amount.share)
     tables["codecs"], answers["codecs"] = bench.codecs(world, three, amount.share)
     tables["lights"] = bench.lights(world, trackers[COLD], amount.still // 4, amount.share)
     for kind, count in (("conditions", amount.seeds), ("occlusions", amount.poses)):
         tables[kind], answers[kind] = bench.scenes(world, three, count, kind, amount.share)
     tables["negatives"], answers["negatives"] = bench.empty(world, two, amount.negatives)
-    tables["second_world"] = second_world(VariedWorld(photographs=world.photographs), amount.varied, amount.lookalikes)
+    varied = VariedWorld(photographs=world.photographs)
+    tables["second_world"] = second_world(varied, amount.varied, amount.lookalikes)
     boards = shared_photographs(boards_folder) if boards_folder else [drawn_photograph()]
     tables["real_pixels"], sheet, found = real_pixels(boards, amount.placed)
     # The frames of catheters at rest are left out of the sum: they repeat a few poses.
@@ -83,7 +95,10 @@ def tracking(
     ]
     rows = _methods(tables, answers)
     pictures = {"chart": draw(rows, tables), "real_pixels": sheet}
-    return rows, tables, pictures, _verdict(world, rows, tables) + [f"synthetic {line}" for line in found]
+    lines = _verdict(world, rows, tables) + [f"synthetic {line}" for line in found]
+    if quick:  # the goals are those of the full number of frames
+        lines = [re.sub(r" \(goal [^()]*\)", "", line) for line in lines]
+    return rows, tables, pictures, lines
 
 
 def _share(kind: str, name: str, own: list[Answer]) -> Row:
@@ -109,7 +124,7 @@ def _methods(tables: dict[str, list[Row]], answers: dict[str, list[Answer]]) -> 
         for grid in ("2D", "3D"):
             errors = one(tables["grids"], grid=grid, method=name)
             row |= {f"{grid}_{key}": errors[key] for key in ("median_mm", "p95_mm", "rigid_median_mm", "acc_mm")}
-        for depth, tilt in STILL:
+        for depth, tilt in dict.fromkeys((row["depth_mm"], row["tilt_deg"]) for row in tables["still"]):
             still = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=TIP, method=name)
             row[f"s_rms_mm_{depth}_{tilt}"] = still["s_rms_mm"]
         # Grids and rest are counted separately, since frames of catheters at rest repeat only a few errors.
@@ -156,7 +171,8 @@ def _verdict(world: World, rows: list[Row], tables: dict[str, list[Row]]) -> lis
         f"torch {torch.__version__}, {torch.get_num_threads()} threads, {os.cpu_count()} cores; all frames synthetic, "
         f"{size}, fx {focal:.0f} px, {look}, {len(world.photographs)} photographs for backgrounds"
     )
-    return [first, *(f"synthetic {line}" for line in lines)]
+    headline, *others = (f"synthetic {line}" for line in lines)
+    return [headline, first, *others]
 
 
 def _accuracy(name: str, rows: list[Row], tables: dict[str, list[Row]]) -> list[str]:

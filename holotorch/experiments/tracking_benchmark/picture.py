@@ -5,8 +5,8 @@ import math
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from holotorch.experiments.runs.figures import figure_png
-from holotorch.experiments.tracking_benchmark.bench import STILL, TIP, Row, one
+from holotorch.experiments.runs.figures import draw_front, figure_png, mark_choice
+from holotorch.experiments.tracking_benchmark.bench import TIP, Row, one
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, PRIOR
 
 _STYLE = {BASE: ("tab:gray", "s"), COLD: ("tab:blue", "o"), PRIOR: ("tab:green", "^"), FEWER: ("tab:orange", "v")}
@@ -28,6 +28,7 @@ def draw(rows: list[Row], tables: dict[str, list[Row]]) -> bytes:
 
 def _errors(axes: Axes, rows: list[Row]) -> None:
     """Error of the tip on the grids over the time per frame: the median, and a line up to the 95th percentile."""
+    points, chosen = [], []
     for row in rows:
         if row["method"] not in _STYLE:
             continue
@@ -36,15 +37,18 @@ def _errors(axes: Axes, rows: list[Row]) -> None:
             if row[f"{grid}_median_mm"] != "":
                 ends = [row[f"{grid}_median_mm"], row[f"{grid}_p95_mm"]]
                 label = f"{row['method']}, {grid} grid"
-                axes.semilogy([row["milliseconds"]] * 2, ends, color=colour, linewidth=0.8)
-                axes.semilogy(row["milliseconds"], ends[0], marker, color=colour, markerfacecolor=fill, label=label)
+                points.append((row["milliseconds"], ends[0]))
+                chosen += [points[-1]] if row["method"] == COLD else []
+                axes.loglog([row["milliseconds"]] * 2, ends, color=colour, linewidth=0.8)
+                axes.loglog(row["milliseconds"], ends[0], marker, color=colour, markerfacecolor=fill, label=label)
     axes.set(xlabel="milliseconds per frame, plain desk", ylabel="tip error: median, line up to p95 (mm)")
-    axes.set_xlim(left=0)
+    draw_front(axes, points)
+    mark_choice(axes, chosen, "default of CatheterTracker")
 
 
 def _precision(axes: Axes, rows: list[Row]) -> None:
     """Spread of a resting tip by method and pose, with the Cramér-Rao bounds."""
-    poses = list(STILL)
+    poses = list(dict.fromkeys((row["depth_mm"], row["tilt_deg"]) for row in rows))
 
     def column(name: str, method: str) -> list[float]:
         own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=method) for depth, tilt in poses]

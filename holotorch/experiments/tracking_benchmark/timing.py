@@ -23,19 +23,17 @@ KORNIA = "thesis, kornia"
 # Names of the conditions whose frames are timed, by kind of frame.
 _FRAMES = {"plain desk": ("plain",), "clutter": ("heavy clutter",), "drape": ("cloth as band 3",)}
 _PHOTOGRAPH = ("photograph 0", "texture")  # the texture is used if the world has no photographs
-_STREAM = 6  # different frames of each kind, of 6 MB each, which together exceed the caches of a processor
-_REPEATS = 9  # repetitions of a call, whose median is not affected by single stalls of the machine
 
 
-def timing(world: World, rounds: int) -> list[Row]:
+def timing(world: World, rounds: int, stream: int) -> list[Row]:
     """Milliseconds per frame of each method and kind of frame, medians over rounds, and ratios to the baseline.
 
-    In each round, each method processes a few different frames one after another, as from a camera. The frames do not
-    fit into the caches of the processor together, while the data of the method itself may stay there.
+    In each round, each method processes ``stream`` different frames one after another, as from a camera. Six frames of
+    6 MB do not fit into the caches of the processor together, while the data of the method itself may stay there.
     """
     kornia = ThesisTracker(world.camera, world.catheter)
     trackers: dict[str, Method] = methods(world) | {KORNIA: lambda frame, _: kornia(frame[None])[0]}
-    worlds = [replace(world, seed=world.seed + i) for i in range(_STREAM)]
+    worlds = [replace(world, seed=world.seed + i) for i in range(stream)]
     scenes = [{case.name: case for case in conditions(one)} for one in worlds]
     rows = []
     for kind, names in tqdm((_FRAMES | {"photograph": _PHOTOGRAPH}).items(), desc="times", unit="frame"):
@@ -45,7 +43,7 @@ def timing(world: World, rounds: int) -> list[Row]:
         seconds = interleaved(calls, rounds)
         for method, value in seconds.items():
             status = count_statuses(Status(pose.status) for pose in _all(trackers[method], frames))
-            row: Row = {"frame": kind, "method": method, "milliseconds": round(1e3 * value / _STREAM, 2)}
+            row: Row = {"frame": kind, "method": method, "milliseconds": round(1e3 * value / stream, 2)}
             rows.append(row | {"ratio": round(value / seconds[BASE], 3), "status": status})
     return rows
 
@@ -83,12 +81,13 @@ def stages(world: World, rounds: int) -> list[Row]:
     return rows
 
 
-def spread(world: World, seeds: int, share: float = 1.0) -> list[Row]:
+def spread(world: World, seeds: int, share: float, repeats: int) -> list[Row]:
     """Time of the slowest frame relative to the median frame, for each method.
 
     The frames are all conditions and occlusions, and one negative of each kind, from ``seeds`` seeds with two
-    photographs of the world each. The time of a frame is a median over a few calls, each divided by the time of a plain
-    frame directly before it, which removes most of the influence of other load on the machine.
+    photographs of the world each. The time of a frame is a median over ``repeats`` calls, which single stalls of the
+    machine do not affect, each divided by the time of a plain frame directly before it, which removes most of the
+    influence of other load.
     """
     cases, plain = [], next(case for case in conditions(world) if case.name == "plain")
     plain_frame = as_camera(plain.frame())
@@ -106,7 +105,7 @@ def spread(world: World, seeds: int, share: float = 1.0) -> list[Row]:
                 continue  # a frame without a catheter has no previous pose
             track(frame, case)
             calls = partial(track, plain_frame, plain), partial(track, frame, case)
-            pairs = [[timed(call)[1] for call in calls] for _ in range(_REPEATS)]
+            pairs = [[timed(call)[1] for call in calls] for _ in range(repeats)]
             ratios[name].append((statistics.median(own / before for before, own in pairs), case.name))
             plain_seconds[name] += [before for before, _ in pairs]
     rows = []

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from holotorch.core.fourier import fft2, good_length, ifft2
 from holotorch.core.grid import Grid
-from holotorch.experiments.runs.figures import figure_png
+from holotorch.experiments.runs.figures import draw_front, figure_png, mark_choice
 from holotorch.experiments.timing import interleaved, timed
 from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram
 from holotorch.hologram.cone import cone_samples, spherical_wave
@@ -29,9 +29,26 @@ TABLE = {
     "Hand": (60, 290, 82.95),
     "Bonsai": (70, 232, 129.93),
 }
-ALL_PLANES = ("Tooth", "Teapot", "Hand", "Bonsai")  # scenes that are also measured with all planes and at full size
-SMALL, WHOLE = 512, 2048  # pixels along each side of a hologram; the thesis has WHOLE
+WHOLE = 2048  # pixels along each side of a hologram of the thesis
 BASE, READY = "thesis's convolutions (Algorithm 5)", "the same, waves at hand"
+AXIAL = "axial nodes, 3e-3"
+
+
+@dataclass(frozen=True)
+class Amount:
+    """Size of the measurement. A hologram of fewer pixels than WHOLE has its scene nearer, and fewer planes."""
+
+    side: int = 512  # pixels along each side of a hologram
+    scenes: tuple[str, ...] = tuple(TABLE)
+    all_planes: tuple[str, ...] = ("Tooth", "Teapot", "Hand", "Bonsai")  # also with all planes, and with WHOLE pixels
+    planes: tuple[int, ...] = (58, 145, 290, 580, 1160)
+    sides: tuple[int, ...] = (256, 512, 1024, 2048)
+    distances: tuple[int, ...] = (20, 40, 60, 80, 120, 160)  # mm, of a hologram of WHOLE pixels
+    rounds: int = 15  # repetitions of a measurement of scaling
+
+
+FULL = Amount()
+QUICK = Amount(128, ("Tooth", "Bonsai"), (), (58, 290), (128, 256), (20, 80), rounds=3)
 
 
 @dataclass(frozen=True)
@@ -108,10 +125,11 @@ class ThesisConvolution:
         return total
 
 
-def volume() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
+def volume(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     """Rows of methods, rows of scaling, pictures by name, and the verdict."""
-    rows, scaling = _methods(), _scaling()
-    return rows, scaling, {"chart": _draw(rows, scaling)}, _verdict(rows, scaling)
+    amount = QUICK if quick else FULL
+    rows, scaling = _methods(amount), _scaling(amount)
+    return rows, scaling, {"chart": _draw(rows, scaling, amount)}, _verdict(rows, scaling, amount)
 
 
 def _calls(scene: Scene, wavelength: float) -> dict[str, Callable[[], Any]]:
@@ -130,13 +148,14 @@ def _calls(scene: Scene, wavelength: float) -> dict[str, Callable[[], Any]]:
     return calls
 
 
-def _methods() -> list[dict]:
-    """Rows of every scene at a quarter of its size and planes in 3 colours; of some with all planes in one colour."""
-    rows = []
-    cases = [(name, mm / 4e3, planes // 4, WAVELENGTHS) for name, (mm, planes, _) in TABLE.items()]
-    cases += [(f"{name}, all planes", TABLE[name][0] / 4e3, TABLE[name][1], WAVELENGTHS[:1]) for name in ALL_PLANES]
+def _methods(amount: Amount) -> list[dict]:
+    """Rows of every scene at a part of its size and planes in 3 colours; of some with all planes in one colour."""
+    rows, part = [], WHOLE // amount.side
+    near = {name: mm / 1e3 / part for name, (mm, _, _) in TABLE.items()}
+    cases = [(name, near[name], TABLE[name][1] // part, WAVELENGTHS) for name in amount.scenes]
+    cases += [(f"{name}, all planes", near[name], TABLE[name][1], WAVELENGTHS[:1]) for name in amount.all_planes]
     for name, distance, planes, wavelengths in tqdm(cases, desc="volume, methods", unit="scene"):
-        scene = Scene(SMALL, distance, planes)
+        scene = Scene(amount.side, distance, planes)
         times: dict[str, float] = {}
         rounds = 3 if len(wavelengths) > 1 else 1
         for wavelength in wavelengths:
@@ -186,17 +205,18 @@ def _direct(scene: Scene, wavelength: float) -> tuple[float, float]:
     return rate, sources * pairs_per_source / rate
 
 
-def _scaling() -> list[dict]:
+def _scaling(amount: Amount) -> list[dict]:
     """Rows of the time of one colour against planes, pixels and distance (thesis Fig. 5.10).
 
     The thesis's method is timed on three planes, and the time is scaled to all planes.
     """
+    side = amount.side
     groups = {
-        "planes": [Scene(SMALL, 7.5e-3, planes) for planes in (58, 145, 290, 580, 1160)],
-        "pixels": [Scene(side, 30e-3 * side / WHOLE, 232) for side in (256, 512, 1024, 2048)],
-        "distance": [Scene(SMALL, distance / 4e3, 63) for distance in (20, 40, 60, 80, 120, 160)],
+        "planes": [Scene(side, 30e-3 * side / WHOLE, planes) for planes in amount.planes],
+        "pixels": [Scene(pixels, 30e-3 * pixels / WHOLE, 232) for pixels in amount.sides],
+        "distance": [Scene(side, distance / 1e3 * side / WHOLE, 63) for distance in amount.distances],
     }
-    groups |= {f"whole: {name}": [Scene(WHOLE, TABLE[name][0] / 1e3, TABLE[name][1])] for name in ALL_PLANES}
+    groups |= {f"whole: {name}": [Scene(WHOLE, TABLE[name][0] / 1e3, TABLE[name][1])] for name in amount.all_planes}
     rows = []
     for what, scenes in tqdm(groups.items(), desc="volume, scaling", unit="series"):
         operators = {s: AxialHologram(s.grid, WAVELENGTHS[0], s.depths, stride=2, tolerance=3e-3) for s in scenes}
@@ -204,7 +224,7 @@ def _scaling() -> list[dict]:
             str(scene): partial(operator.accumulate, torch.stack([*scene.amplitudes()]), scene.phase)
             for scene, operator in operators.items()
         }
-        times = interleaved(calls, rounds=1 if scenes[-1].side == WHOLE else 15)
+        times = interleaved(calls, rounds=1 if scenes[-1].side == WHOLE else amount.rounds)
         for scene, operator in operators.items():
             thesis = ThesisConvolution(scene, WAVELENGTHS[0])
             thesis(1)  # warms up
@@ -229,33 +249,37 @@ def _scaling() -> list[dict]:
     return rows
 
 
-def _verdict(rows: list[dict], scaling: list[dict]) -> list[str]:
-    lines = [
-        f"torch {torch.__version__}, {torch.get_num_threads()} threads; random sources in a ball as wide as the "
-        f"hologram, rays on every second pixel; "
-        f"speed relative to {BASE} in the same process (relative L2 error to the same cone of light in complex128)"
-    ]
-    for name in TABLE:
+def _verdict(rows: list[dict], scaling: list[dict], amount: Amount) -> list[str]:
+    lines = []
+    for name in amount.scenes:
         base, *others = (row for row in rows if row["scene"] == name)
         errors = [f" ({row['error']})" if row["error"] else "" for row in others]
         parts = [f"{row['method']} {row['over_thesis']}{error}" for row, error in zip(others, errors, strict=True)]
-        lines.append(f"{name}, {SMALL} px, {base['planes']} planes, 3 colours: " + "; ".join(parts))
-    for name in ALL_PLANES:
-        small = next(r for r in rows if r["scene"] == f"{name}, all planes" and r["method"] == "axial nodes, 3e-3")
+        lines.append(f"{name}, {amount.side} px, {base['planes']} planes, 3 colours: " + "; ".join(parts))
+    lines[0] += f"; times as fast as {BASE} in the same process (relative L2 error)"
+    lines.insert(
+        1,
+        f"torch {torch.__version__}, {torch.get_num_threads()} threads; random sources in a ball as wide as the "
+        "hologram, rays on every second pixel; errors to the same cone of light in complex128",
+    )
+    for name in amount.all_planes:
+        small = next(r for r in rows if r["scene"] == f"{name}, all planes" and r["method"] == AXIAL)
         big = next(row for row in scaling if row["against"] == f"whole: {name}")
         lines.append(
-            f"{name}, all {big['planes']} planes: {small['over_thesis']} at {SMALL} px, {big['over_thesis']} at "
+            f"{name}, all {big['planes']} planes: {small['over_thesis']} at {amount.side} px, {big['over_thesis']} at "
             f"{WHOLE} px ({big['seconds']} s a colour, {big['nodes']} nodes); thesis on its GPU "
             f"{TABLE[name][2] / 3:.1f} s a colour"
         )
     cost = {row["planes"]: float(row["seconds"]) for row in scaling if row["against"] == "planes"}
-    lines.append(f"1160 planes cost {cost[1160] / cost[290]:.2f} times as much as 290 (4 with the thesis's method)")
+    few, most = amount.planes[-3:][0], amount.planes[-1]
+    ratio = f"{cost[most] / cost[few]:.2f} times as much as {few} ({most / few:g} with the thesis's method)"
+    lines.append(f"{most} planes cost {ratio}")
     rates = [float(row["direct_pairs_per_s"]) for row in rows]
     lines.append(f"direct sum, float64: {min(rates):.1e} to {max(rates):.1e} pairs per second")
     return lines
 
 
-def _draw(rows: list[dict], scaling: list[dict]) -> bytes:
+def _draw(rows: list[dict], scaling: list[dict], amount: Amount) -> bytes:
     figure = Figure(figsize=(15, 7.5), layout="constrained")
     axes, *others = figure.subplots(2, 2).flat
     for k, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
@@ -263,14 +287,20 @@ def _draw(rows: list[dict], scaling: list[dict]) -> bytes:
         if selected:
             points = [float(row["seconds"]) for row in selected], [float(row["error"]) for row in selected]
             axes.loglog(*points, "os^vD"[k], label=method, color=f"C{k}")
-    axes.set(xlabel=f"seconds, three colours at {SMALL} px", ylabel="relative L2 error")
+            if method == AXIAL:
+                mark_choice(axes, zip(*points, strict=True), "automatic choice for 3e-3")
+    for i, scene in enumerate(amount.scenes):
+        selected = [row for row in rows if row["scene"] == scene and row["error"]]
+        front = [(float(row["seconds"]), float(row["error"])) for row in selected]
+        draw_front(axes, front, "" if i else "Pareto front of each scene")
+    axes.set(xlabel=f"seconds, three colours at {amount.side} px", ylabel="relative L2 error")
     keys = {"planes": "planes", "pixels": "side", "distance": "distance_mm"}
     labels = ("planes", "pixels a side", "distance (mm)")
     for axes, (against, key), label in zip(others, keys.items(), labels, strict=True):
         selected = [row for row in scaling if row["against"] == against]
         values = [float(row[key]) for row in selected]
         axes.loglog(values, [float(row["thesis_seconds"]) for row in selected], "o-", label=BASE)
-        axes.loglog(values, [float(row["seconds"]) for row in selected], "^-", label="axial nodes, 3e-3")
+        axes.loglog(values, [float(row["seconds"]) for row in selected], "^-", label=AXIAL)
         axes.set(xlabel=label, ylabel="seconds a colour")
     for axes in figure.axes:
         axes.legend(fontsize=8)

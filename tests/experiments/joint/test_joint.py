@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -232,19 +233,12 @@ def test_equal_images_have_no_error_and_flat_ones_no_contrast():
 
 
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
-    for name, value in {
-        "SEEDS": (7,),
-        "SIZE": 24,
-        "STEPS": 3,
-        "BUDGETS": (2, 3),
-        "BITS": (6,),
-        "WRONG": (0.05,),
-        "LIGHT": (0.0,),
-    }.items():
-        monkeypatch.setattr(joint_chart, name, value)
-    monkeypatch.setattr(joint_chart, "SCENES", ("teapot",))
+    amount = {"cases": ("8 frames", "parallax"), "size": 24, "steps": 3, "budgets": (2, 3), "light": (0.0,)}
+    monkeypatch.setattr(joint_chart, "FULL", replace(joint_chart.QUICK, **amount))
     made = joint_chart._experiment
-    monkeypatch.setattr(joint_chart, "_experiment", lambda scene, seed, words: made(scene, seed, [SCENE, *words]))
+    monkeypatch.setattr(
+        joint_chart, "_experiment", lambda scene, seed, words, of: made(scene, seed, [SCENE, *words], of)
+    )
     monkeypatch.setattr(joint_chart, "CASES", {"8 frames": ([], ("random",)), "parallax": (["eye.parallax=2"], ())})
     monkeypatch.delenv(joint_chart.VOLUMES, raising=False)
     assert main(["chart", "joint", "--out", str(tmp_path / "c")]) == 0

@@ -11,6 +11,7 @@ from holotorch.cli import main
 from holotorch.experiments.pec_study import chart as chart_pec
 from holotorch.experiments.pec_study import studies as pec_studies
 from holotorch.experiments.pec_study.bench import Bench, Track, butterworth, photograph
+from holotorch.experiments.pec_study.chart import Amount
 from holotorch.experiments.pec_study.studies import STUDIES
 
 SWEEP = {"lowpass": "[0.2]"}
@@ -47,10 +48,7 @@ def test_check_says_what_a_study_does(study, capsys):
 
 
 def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(chart_pec, "SIGMAS", (0.66,))
-    monkeypatch.setattr(chart_pec, "SIZE", 32)
-    monkeypatch.setattr(chart_pec, "STEPS", 24)
-    monkeypatch.setattr(chart_pec, "LEVELS", {0.66: (0.3, 0.6)})
+    monkeypatch.setattr(chart_pec, "FULL", Amount({0.66: (0.3, 0.6)}, size=32, steps=24))
     goals = tmp_path / "goals.yaml"
     monkeypatch.setattr(chart_pec, "GOALS", goals)
     goals.write_text("solver: {0.66: {evaluations: 0.01, seconds: 0.0001}}\ntables: {}\n")
@@ -69,7 +67,7 @@ def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
 def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
     """Only the chart command compares them; a study has none. The committed ones fit the committed table."""
     row = {"kind": "fresnel", "sigma_px": 1.0, "solver": "L-BFGS", "evaluations_ratio": 3.0, "seconds_ratio": 1.5}
-    lines = chart_pec._verdict([row])
+    lines = chart_pec._verdict([row], chart_pec.FULL)
     assert next(line for line in lines if line.startswith("fresnel, sigma 1:")).endswith("(goal 4/1.8: not met)")
     assert lines[-1] == "targets: 32 met of 32"
     summaries = [line for line in lines if re.fullmatch(r"\w+: (\d+ [a-z ]+,? ?)+of \d+", line)]
@@ -78,7 +76,9 @@ def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
     for line in summaries:
         assert sum(map(int, re.findall(r"(\d+) [a-z]", line.split(" of ")[0]))) == int(line.split(" of ")[1])
     monkeypatch.setattr(chart_pec, "GOALS", tmp_path / "goals.yaml")
-    assert not any("goal" in line or " met" in line for line in chart_pec._verdict([row]))  # an installed package
+    assert not any(
+        "goal" in line or " met" in line for line in chart_pec._verdict([row], chart_pec.FULL)
+    )  # an installed package
     (tmp_path / "one").mkdir()
     (tmp_path / "one" / "table.csv").write_text(
         "method,sigma_px,ssim,seconds\na,1.0,0.5,2\na,2.0,0.9,4\nb,1.0,,6\nc,0.1,0.9,1\nc,0.2,0.87,1\nc,0.3,0.8,1\n"
@@ -102,7 +102,7 @@ goals:
   one: [{says: reached, rows: {method: a}, within: [0.6, 1]}]
 """
     )
-    assert chart_pec._verdict([row])[-12:] == [
+    assert chart_pec._verdict([row], chart_pec.FULL)[-12:] == [
         "one: 5 reproduced, 3 not reproduced, 1 not testable here, 1 exceeded of 10",
         "  reproduced: mean (0.7, expected 0.7 to 0.7)",
         "  reproduced: range (0.4, expected 0.39 to 0.41)",

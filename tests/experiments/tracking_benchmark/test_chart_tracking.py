@@ -10,8 +10,6 @@ from holotorch.cli import main
 from holotorch.experiments.tracking_benchmark import bench as tracking_bench
 from holotorch.experiments.tracking_benchmark import chart as chart_tracking
 from holotorch.experiments.tracking_benchmark import methods as tracking_methods
-from holotorch.experiments.tracking_benchmark import picture as tracking_picture
-from holotorch.experiments.tracking_benchmark import timing as tracking_timing
 from holotorch.experiments.tracking_benchmark.bound import Bounds, tip_bounds
 from holotorch.experiments.tracking_benchmark.chart import Amount
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer, before, methods
@@ -26,6 +24,7 @@ from holotorch.tracking.simulation.varied import VariedWorld
 from holotorch.tracking.simulation.world import World, aimed
 
 TILT = math.radians(20)
+SMALL = Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, placed=1, stream=2, repeats=1, share=0.06)
 
 
 def small(**changes) -> World:
@@ -37,12 +36,10 @@ def small(**changes) -> World:
 
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_tracking, "scene", lambda _: small())
-    monkeypatch.setattr(chart_tracking, "AMOUNT", Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, placed=1, share=0.06))
-    for module in (chart_tracking, tracking_bench, tracking_picture):
+    monkeypatch.setattr(chart_tracking, "FULL", SMALL)
+    for module in (chart_tracking, tracking_bench):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
     monkeypatch.setattr(tracking_bench, "tip_bounds", lambda *_: Bounds(1e-9 * torch.eye(3), 2e-9 * torch.eye(3)))
-    monkeypatch.setattr(tracking_timing, "_REPEATS", 1)
-    monkeypatch.setattr(tracking_timing, "_STREAM", 2)
     assert main(["chart", "tracking", "--out", str(tmp_path)]) == 0
     names = [
         "codecs",
