@@ -187,7 +187,8 @@ def _parser() -> argparse.ArgumentParser:
 
     chart = command("chart", _chart, "speed against accuracy of every method, drawn and tabled")
     chart.add_argument(
-        "subject", help="what to chart: camera, chain, eye, joint, network, pec, propagation, tracking, volume"
+        "subject",
+        help="what to chart: camera, chain, eye, joint, network, pec, propagation, stability, tracking, volume",
     )
     chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
 

@@ -17,6 +17,7 @@ CHARTS = {
     "network": ("holotorch.experiments.network.chart", "training"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
     "propagation": ("holotorch.experiments.propagation.chart", "prediction"),
+    "stability": ("holotorch.experiments.stability.chart", ""),
     "tracking": ("holotorch.experiments.tracking_benchmark.chart", "grids"),
     "volume": ("holotorch.experiments.volume.chart", "scaling"),
 }

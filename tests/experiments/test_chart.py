@@ -28,8 +28,8 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
 def test_unknown_subject(tmp_path, capsys):
     assert main(["chart", "propagatoin", "--out", str(tmp_path)]) == 2
     assert (
-        "no chart of 'propagatoin'; known: camera, chain, eye, joint, network, pec, propagation, tracking, volume"
-        in capsys.readouterr().err
+        "no chart of 'propagatoin'; known: camera, chain, eye, joint, network, pec, propagation, stability, tracking, "
+        "volume" in capsys.readouterr().err
     )
 
 
