@@ -13,7 +13,7 @@ from holotorch.experiments.stability.picture import draw
 from holotorch.experiments.stability.sweep import DEFAULT, SILENT, Point, Sweep
 
 # Modules of this package whose function ``sweeps`` lists sweeps.
-SYSTEMS = ("propagation", "propagators", "heat", "holograms")
+SYSTEMS = ("propagation", "propagators", "heat", "holograms", "retinas", "light", "scene", "tracking")
 
 
 def all_sweeps() -> list[Sweep]:
@@ -23,8 +23,11 @@ def all_sweeps() -> list[Sweep]:
 
 def stability() -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
     """Table rows of all points, further tables (none), PNG pictures by name, and lines of text."""
-    points = [point for sweep in tqdm(all_sweeps(), desc="stability", unit="sweep") for point in sweep.points()]
-    return [row(point) for point in points], {}, {"chart": draw(points)}, verdict(points)
+    sweeps = all_sweeps()
+    points = [point for sweep in tqdm(sweeps, desc="stability", unit="sweep") for point in sweep.points()]
+    known = [f"{sweep.name}: {sweep.known}" for sweep in sweeps if sweep.known]
+    rows, pictures = [row(point) for point in points], {"chart": draw(points)}
+    return rows, {}, pictures, [*verdict(points), *(f"left: {each}" for each in known)]
 
 
 def row(point: Point) -> dict[str, Any]:
@@ -56,7 +59,7 @@ def verdict(points: list[Point]) -> list[str]:
     ]
     lines += [f"silent: {each.label}: error {each.measured:.1e} for {each.tolerance:.1e}" for each in silent]
     ratios = [p.predicted / p.measured for p in points if _both(p)]
-    if ratios:
+    if len(ratios) > 1:
         low, middle, high = (statistics.quantiles(ratios, n=20)[i] for i in (0, 9, 18))
         lines.append(
             f"predicted / measured error: median {middle:.2f}, 5 % below {low:.2f} and 5 % above {high:.2g}, over "
