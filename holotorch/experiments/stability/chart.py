@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from holotorch.experiments.stability.picture import draw
-from holotorch.experiments.stability.sweep import DEFAULT, SILENT, Point, Sweep
+from holotorch.experiments.stability.sweep import SILENT, Point, Sweep
 
 # Modules of this package whose function ``sweeps`` lists sweeps.
 SYSTEMS = ("propagation", "propagators", "heat", "holograms", "retinas", "light", "scene", "tracking")
@@ -54,7 +54,7 @@ def verdict(points: list[Point]) -> list[str]:
     said = ", ".join(f"{counts[each]} {each}" for each in ("nothing", "switched", "warned", "refused"))
     lines = [
         f"torch {torch.__version__}; {len(points)} points of {len(sweeps)} sweeps; said: {said}",
-        "tolerances: " + ", ".join(f"{count} {source}" for source, count in sources.items()) + f" ({DEFAULT:g})",
+        "tolerances: " + ", ".join(f"{count} {source}" for source, count in sources.items()),
         f"silent failures (an error above {SILENT} tolerances without a word): {len(silent)}",
     ]
     lines += [f"silent: {each.label}: error {each.measured:.1e} for {each.tolerance:.1e}" for each in silent]

@@ -80,8 +80,8 @@ def _exact(scene: Scene) -> Tensor:
 def sweeps() -> list[Sweep]:
     """Depth, depth range, number of planes, pitch, stride, cone and tolerance of the three ways."""
     base = Scene()
-    depths = (2e-5, 1e-4, 5e-4, 2e-3, 8e-3, 0.05, 0.2)
-    extents = (0.0, 1e-4, 1e-3, 1e-2, 0.04)
+    depths = (2e-5, 1e-4, 5e-4, 2e-3, 8e-3, 0.05, 0.5)
+    extents = (0.0, 1e-4, 1e-3, 1e-2, 0.02)
     tolerances = (0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8)
     pitches = (0.2e-6, 0.4e-6, 0.5e-6, 0.7e-6, 1e-6, 4e-6, 12e-6)
     cones = "full", "box", "disc", "taper", "band"

@@ -19,20 +19,23 @@ def draw(points: list[Point]) -> bytes:
     for point in points:
         sweeps.setdefault((point.method, point.swept), []).append(point)
     rows = math.ceil(len(sweeps) / _COLUMNS)
-    figure = Figure(figsize=(2.9 * _COLUMNS, 2.3 * rows + 0.6), layout="constrained")
+    tall = 2.3 * rows + 0.8  # inches
+    figure = Figure(figsize=(2.9 * _COLUMNS, tall))
     panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
+    # A constrained layout of so many panels takes longer than many of their sweeps.
+    figure.subplots_adjust(0.05, 0.6 / tall, 0.99, 1 - 0.7 / tall, wspace=0.35, hspace=0.65)
     for axes, ((method, swept), own) in zip(panels, sweeps.items(), strict=False):
         _draw_sweep(axes, own)
         axes.set_title(method, fontsize=8)
         axes.set_xlabel(swept, fontsize=7)
-        axes.tick_params(labelsize=6)
+        axes.tick_params(which="both", labelsize=6)
     for axes in panels[len(sweeps) :]:
         axes.set_axis_off()
     handles = [panels[0].plot([], [], mark, color=_COLOURS[said], label=said)[0] for said, mark in _MARKS.items()]
     handles += panels[0].plot([], [], "k--", linewidth=1, label="predicted")
     handles += panels[0].plot([], [], "k:", linewidth=1, label="tolerance")
     handles += panels[0].plot([], [], "o", color="r", markersize=9, label=f"silent: beyond {SILENT} tolerances")
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=9)
+    figure.legend(handles=handles, loc="upper center", ncols=len(handles), fontsize=9)
     figure.supylabel("error; a mark says what the method said", fontsize=9)
     return figure_png(figure)
 
@@ -54,7 +57,9 @@ def _draw_sweep(axes, points: list[Point]) -> None:
 def _positions(axes, points: list[Point]) -> list[float]:
     """Places of the points along x; numbers on a logarithmic axis if they span decades, words in their order."""
     if any(isinstance(point.value, str) for point in points):
-        axes.set_xticks(range(len(points)), [str(point.value) for point in points], rotation=20)
+        words = [str(point.value) for point in points]
+        few = len(words) <= _COLUMNS  # more words do not fit; the table has them
+        axes.set_xticks(range(len(words)), words if few else range(1, len(words) + 1))
         return [float(i) for i in range(len(points))]
     values = [float(point.value) for point in points]
     sizes = sorted(abs(value) for value in values if value)
