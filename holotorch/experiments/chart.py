@@ -12,6 +12,7 @@ from holotorch.io.files import write_bytes, write_text
 # further tables return them by name instead. The subjects whose full form takes the least time come first.
 CHARTS = {
     "propagation": ("holotorch.experiments.propagation.chart", "prediction"),
+    "stability": ("holotorch.experiments.stability.chart", ""),
     "volume": ("holotorch.experiments.volume.chart", "scaling"),
     "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
     "camera": ("holotorch.experiments.camera.chart", "corrected"),

@@ -68,6 +68,14 @@ def test_inverse_refuses_a_kernel_that_erases_a_pattern():
     assert torch.isfinite(deconvolve(ThermalCrosstalk(low, 7), torch.rand(1, 24, 9))).all()
 
 
+def test_inverse_refuses_what_both_axes_together_amplify_beyond_rounding():
+    """Each axis alone is invertible; with both, heater phases came back 4 % off."""
+    crosstalk = ThermalCrosstalk(3.0)
+    inverse(crosstalk, torch.rand(37, 1, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"has no inverse on \(37, 30\) px"):
+        inverse(crosstalk, torch.rand(37, 30, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("solve", [inverse, deconvolve_admm])
 @pytest.mark.parametrize("patch", [LOPSIDED, LOPSIDED + LOPSIDED.flip(0, 1)], ids=["lopsided", "not separable"])
 def test_matrix_methods_refuse_other_kernels(solve, patch):

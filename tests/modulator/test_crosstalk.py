@@ -1,4 +1,5 @@
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -6,6 +7,7 @@ import torch
 from oracles import dense
 from torch.nn import functional
 
+from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import convolve
 from holotorch.modulator import ThermalCrosstalk
 
@@ -140,3 +142,12 @@ def test_fit_refuses_what_has_no_width():
         ThermalCrosstalk.fitted(torch.ones(3, 3))
     with pytest.raises(ValueError, match="patch must have two odd sizes"):
         ThermalCrosstalk.fitted(torch.ones(2, 3))
+
+
+def test_taps_that_cut_the_kernel_are_said():
+    with pytest.warns(SamplingWarning, match=r"7 taps lose 18% of the heat of sigma_px=3; size=23 or size=None"):
+        cut = ThermalCrosstalk(3.0, 7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert ThermalCrosstalk(3.0, 23).lost_heat < 1e-5 < cut.lost_heat
+        ThermalCrosstalk(2.5, 7)  # the thesis's largest sigma

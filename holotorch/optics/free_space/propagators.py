@@ -18,6 +18,8 @@ from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.geometry import least_padding
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
 
+_NEGLECTED = 2.0  # rad: phase beyond Fresnel at the corner of the band that makes noise err by half (measured)
+
 
 class SpectralFilter(FieldOperator):
     """A linear operator that is diagonal in frequency.
@@ -241,6 +243,10 @@ class Fresnel(_PaddedKernel):
 
     Arguments, errors and the warning are those of :class:`AngularSpectrum`. The relative error is about
     k z (wavelength f)^4 / 8, where f is the highest frequency of the field. ``pad=1`` is the thesis's model (Sec. 4.5).
+
+    Warns:
+        SamplingWarning: This error exceeds 2 at the highest frequencies of the grid. Noise that fills the band is then
+            off by half. The warning may be ignored for a field of lower frequencies.
     """
 
     def __init__(
@@ -255,13 +261,26 @@ class Fresnel(_PaddedKernel):
         super().__init__(
             grid, wavelengths, distance, pad, fresnel_kernel, 40, paraxial=True, wraps=True, learnable=learnable
         )
+        # The neglected phase is proportional to the cube of the wavelength.
+        z, longest = checked_distance(distance), max(self.wavelengths)
+        square = sum((longest / (2 * pitch)) ** 2 for pitch in grid.pitch)
+        neglected = 2 * math.pi / longest * abs(z) * square**2 / 8
+        if neglected > _NEGLECTED:
+            warnings.warn(
+                f"Fresnel over {z:g} m: light of the grid's highest frequencies at {longest:g} m wavelength lacks a "
+                f"phase of {neglected:.2g} rad; AngularSpectrum and CroppedKernel include it",
+                SamplingWarning,
+                stacklevel=2,
+            )
 
 
 class Fraunhofer(FieldOperator):
     """Far field: the unitary DFT with the origin of both planes on sample ``n // 2``. The adjoint is the inverse.
 
     Output sample m (counted from the centre) of an axis with n samples belongs to the direction
-    sin(angle) = m wavelength / (n pitch). Source: thesis Eq. 4.10.
+    sin(angle) = m wavelength / (n pitch). No distance enters: at a distance z the relative error of the amplitude is
+    about pi r^2 / (wavelength z), a phase that is neglected, with r from the axis to the corner of the window.
+    Source: thesis Eq. 4.10.
     """
 
     def __init__(self, grid: Grid, wavelengths: Wavelengths):

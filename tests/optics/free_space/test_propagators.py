@@ -85,3 +85,13 @@ def test_far_field_of_a_tilted_wave_is_one_bright_sample():
 
 def test_modules_print_what_they_are():
     assert "pitch=(8e-06, 1e-05)" in repr(AngularSpectrum(GRID, 530e-9, 1e-3))
+
+
+def test_fresnel_says_where_its_model_ends():
+    """Padding suffices at both distances; only the phase beyond Fresnel differs."""
+    grid = Grid(160, 1.5e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Fresnel(grid, 530e-9, 3e-4)
+    with pytest.warns(SamplingWarning, match=r"lacks a phase of 3.5 rad; AngularSpectrum and CroppedKernel"):
+        Fresnel(grid, 530e-9, -6e-4)
