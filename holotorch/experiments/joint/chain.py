@@ -45,7 +45,7 @@ class Amount:
 
 
 FULL = Amount()
-QUICK = Amount(size=96, frames=2, steps=4, checked=4)
+QUICK = Amount(size=128, frames=2, steps=4, checked=4)
 
 
 def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
