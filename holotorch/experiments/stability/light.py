@@ -31,15 +31,15 @@ LOOSE = 0.5  # tolerance of the propagation of a single wavelength, which is not
 
 def sweeps() -> list[Sweep]:
     """Sweeps of the width of the spectrum, the distance and the tolerance."""
-    widths = (0.1e-9, 1e-9, 5e-9, 20e-9)
+    widths = (0.1e-9, 1e-9, 5e-9, 12e-9)
     tolerances = (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5)
     return [
         Sweep("Spectrum.samples", "width (m)", widths, partial(_few, 20e-3, TOLERANCE), partial(_many, 20e-3),
               TOLERANCE, ASKED),
-        Sweep("Spectrum.samples", "distance (m)", (1e-4, 1e-3, 1e-2, 0.1), lambda z: _few(z, TOLERANCE, 10e-9),
+        Sweep("Spectrum.samples", "distance (m)", (1e-4, 1e-3, 1e-2, 0.05), lambda z: _few(z, TOLERANCE, 10e-9),
               lambda z: _many(z, 10e-9), TOLERANCE, ASKED),
-        Sweep("Spectrum.samples", "tolerance", tolerances, lambda t: _few(20e-3, t, 20e-9),
-              lambda _: _many(20e-3, 20e-9), tolerance_from=ASKED),
+        Sweep("Spectrum.samples", "tolerance", tolerances, lambda t: _few(10e-3, t, 10e-9),
+              lambda _: _many(10e-3, 10e-9), tolerance_from=ASKED),
         Sweep("SpectralRetina", "width (m)", widths, partial(_followed, TOLERANCE),
               partial(_each, TOLERANCE), TOLERANCE, ASKED),
         Sweep("SpectralRetina", "tolerance", tolerances, lambda t: _followed(t, 20e-9), lambda t: _each(t, 20e-9),
