@@ -200,10 +200,11 @@ def _scores(
 
 
 def _headline(rows: list[dict]) -> str:
-    shown = {row["method"]: row for row in rows if row["light"] == SOURCES["sled"]}
-    joint, ideal = shown["joint correction for SLED"], shown["ideal complex fields, random phases averaged"]
+    light = list(SOURCES.values())[-1]
+    shown = {row["method"]: row for row in rows if row["light"] == light}
+    joint, ideal = shown[f"joint correction for {light}"], shown["ideal complex fields, random phases averaged"]
     return (
-        f"shown by an SLED, the joint correction for it has SSIM {joint['ssim']:.3f} and {joint['psnr']:.1f} dB, ideal "
+        f"shown by {light}, the joint correction for it has SSIM {joint['ssim']:.3f} and {joint['psnr']:.1f} dB, ideal "
         f"complex fields of random phases {ideal['ssim']:.3f} and {ideal['psnr']:.1f} dB"
     )
 

@@ -1,5 +1,6 @@
 """Settings of a configuration of kind ``pec_study``."""
 
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +16,7 @@ def _photographs(value: Any) -> Any:
     """The entries, with the pictures of a folder in its place, by name."""
     entries: list[Any] = []
     for entry in several(value):
-        if isinstance(entry, str) and Path(entry).is_dir():
+        if isinstance(entry, str) and os.path.isdir(entry):  # False, unlike Path's, for a name that is too long
             entries += [str(path) for path in sorted(Path(entry).iterdir()) if path.suffix.lower() in _PICTURES]
         else:
             entries.append(entry)

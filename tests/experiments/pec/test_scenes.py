@@ -12,6 +12,7 @@ import torch
 from oracles import array
 
 from holotorch.experiments.execute import execute
+from holotorch.experiments.pec import baselines as module
 from holotorch.experiments.pec.baselines import baseline
 from holotorch.experiments.pec.experiment import build
 from holotorch.experiments.pec.report import METHOD_NAMES
@@ -155,7 +156,8 @@ BASELINES = ("none", "chopping", "shifting", "nonnegative", "basic_ipec", "ipec"
     [[], ["target.region=[12,12]"], ["propagator={kind: fresnel, distance: 20 mm}"], ["frames=2"]],
     ids=lambda words: " ".join(words) or "fourier",
 )
-def test_every_baseline_runs_and_is_reported(tmp_path, words, capsys):
+def test_every_baseline_runs_and_is_reported(tmp_path, words, capsys, monkeypatch):
+    monkeypatch.setattr(module, "PASSES", 20)
     listed = f"report.baselines=[{','.join(BASELINES)}]"
     assert execute(settings("solver={kind: lbfgs, max_steps: 60}", *words, listed), tmp_path / "a")[1]
     methods = json.loads((tmp_path / "a" / "summary.json").read_text())["methods"]

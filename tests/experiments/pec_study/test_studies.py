@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from holotorch.cli import main
+from holotorch.experiments.pec_study import bench as pec_bench
 from holotorch.experiments.pec_study import chart as chart_pec
 from holotorch.experiments.pec_study import studies as pec_studies
 from holotorch.experiments.pec_study.bench import Bench, Track, butterworth, photograph
@@ -20,6 +21,7 @@ SWEEP = {"lowpass": "[0.2]"}
 @pytest.mark.parametrize("study", STUDIES)
 def test_every_study_fills_its_folder(study, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(pec_studies, "SIZES", (16, 32))
+    monkeypatch.setattr(pec_bench, "PASSES", 3)
     words = [f"configs/pec/studies/{study}.yaml", "images=[camera,coffee]", "size=24", "max_steps=6"]
     words.append(f"sweep={SWEEP.get(study, '[0.66]')}")
     assert main(["run", *words, "--out", str(tmp_path / "s")]) == 0
