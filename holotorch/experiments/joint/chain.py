@@ -54,11 +54,11 @@ def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[
     amount = QUICK if quick else FULL
     eye = _observer(amount.size)
     foci = sorted(eye.scene.depths)[:: max(1, (PLANES - 1) // 2)]
-    wavelengths, places = eye.scene.settings.wavelengths, [(eye.display, eye.eye(z)) for z in foci]
-    retinas = [Retina(eye.scene.grid, wavelengths, *place, plane=z) for place, z in zip(places, foci, strict=True)]
+    wavelengths, optics = eye.scene.settings.wavelengths, [(eye.display, eye.eye(z)) for z in foci]
+    retinas = [Retina(eye.scene.grid, wavelengths, *each, plane=z) for each, z in zip(optics, foci, strict=True)]
     views, wanted = RetinaViews(retinas), _wanted(eye, retinas, foci)
     spectra = [PRESETS["sled"](each).samples(TRAINED) for each in wavelengths]
-    spectral = [SpectralRetina(eye.scene.grid, spectra, *place, recompute=True) for place in places]
+    spectral = [SpectralRetina(eye.scene.grid, spectra, *each, recompute=True) for each in optics]
     crosstalk = ThermalCrosstalk(SIGMA)
     generator = torch.Generator().manual_seed(SEED)
     fields = torch.stack([_random_field(eye, generator) for _ in range(amount.frames)])
@@ -157,8 +157,8 @@ def _scaled(image: Tensor, scale: float) -> Tensor:
     height, width = image.shape[-2:]
     y, x = ((torch.arange(n) - n // 2) / scale + n // 2 for n in (height, width))
     # Coordinates of grid_sample: -1 and 1 are the outer edges of the first and last samples.
-    places = torch.stack(torch.meshgrid((2 * y + 1) / height - 1, (2 * x + 1) / width - 1, indexing="ij")[::-1], -1)
-    moved = functional.grid_sample(image[None], places[None], mode="bicubic", align_corners=False)[0]
+    positions = torch.stack(torch.meshgrid((2 * y + 1) / height - 1, (2 * x + 1) / width - 1, indexing="ij")[::-1], -1)
+    moved = functional.grid_sample(image[None], positions[None], mode="bicubic", align_corners=False)[0]
     return moved / scale**2
 
 
@@ -179,14 +179,14 @@ def _scores(
     """Scores of fields [F, C, H, W] under a light source, and their images, scaled as wanted."""
     with torch.no_grad():
         if source is None:
-            seen = torch.stack([views(each) for each in emitted]).mean(0)
+            observed = torch.stack([views(each) for each in emitted]).mean(0)
         else:
             frames = [[eye.image(each.conj(), source, focus) for focus in foci] for each in emitted]
-            seen = torch.stack([torch.stack(each, 1) for each in frames]).mean(0)
+            observed = torch.stack([torch.stack(each, 1) for each in frames]).mean(0)
         arrives = views(emitted[0]).sum((-2, -1)).mean(-1) / intensity(emitted[0]).sum((-2, -1))
-    seen = seen * best_scale(seen, wanted, -3)[:, None, None, None]
+    observed = observed * best_scale(observed, wanted, -3)[:, None, None, None]
     peak = wanted.amax((1, 2, 3), keepdim=True)
-    one, other = seen / peak, wanted / peak
+    one, other = observed / peak, wanted / peak
     bright = other > 0.3
     ratio = one[bright] / other[bright]
     quality = ssim(one.clamp(0, 1), other, data_range=1.0)
@@ -196,7 +196,7 @@ def _scores(
         "contrast": (ratio.std() / ratio.mean()).item(),
         "light_on_retina": arrives.mean().item(),
     }
-    return {key: round(value, 4) for key, value in numbers.items()}, seen
+    return {key: round(value, 4) for key, value in numbers.items()}, observed
 
 
 def _headline(rows: list[dict]) -> str:

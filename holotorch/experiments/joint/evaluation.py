@@ -28,10 +28,10 @@ def evaluate(experiment: JointExperiment, shown: Shown) -> tuple[dict[str, Any],
         for name, each in views.items():
             if each is None:
                 continue
-            seen = shown.images(each.operator)
+            observed = shown.images(each.operator)
             if name == "stack":
-                scale = best_scale(seen, each.images, -3)[:, None, None, None]
-            images[name] = seen * scale
+                scale = best_scale(observed, each.images, -3)[:, None, None, None]
+            images[name] = observed * scale
             numbers |= {f"{name}_{key}": value for key, value in errors(images[name], each.images).items()}
         field = experiment.stack.operator(shown.fields)[:, :, len(experiment.foci) // 2]
         numbers["light_in_pupil"] = (intensity(field).sum() / intensity(shown.fields).sum()).item()

@@ -25,8 +25,8 @@ class Shown:
         """Mean intensities of the frames in each view, [C, V, H, W]."""
         total = torch.zeros((), device=self.fields.device)
         for f, field in enumerate(self.fields):  # one by one, to save memory
-            seen = intensity(views(field))
-            total = total + (seen if self.laser is None else seen * self.laser[f, :, None, None, None])
+            observed = intensity(views(field))
+            total = total + (observed if self.laser is None else observed * self.laser[f, :, None, None, None])
         return total / len(self.fields)
 
 

@@ -54,8 +54,8 @@ def sweep(experiment: JointExperiment, shown: Shown, peak: Tensor) -> bytes:
     count = _SWEEP if far > near else 1
     views = experiment.at_foci(torch.linspace(near, far, count, dtype=torch.float64).tolist())
     with torch.no_grad():
-        seen = shown.images(views.operator)
-    scale = (seen * views.images).sum((1, 2, 3)) / seen.square().sum((1, 2, 3))
-    pair = [picture(experiment, each, peak) for each in (views.images, seen * scale[:, None, None, None])]
+        observed = shown.images(views.operator)
+    scale = (observed * views.images).sum((1, 2, 3)) / observed.square().sum((1, 2, 3))
+    pair = [picture(experiment, each, peak) for each in (views.images, observed * scale[:, None, None, None])]
     frames = list(torch.cat(pair, -1).unbind(1))
     return encode_animation(frames + frames[-2:0:-1], _SECONDS)

@@ -114,12 +114,12 @@ def visit(rests: Sequence[Rest], grid: Grid) -> Visited:
         at[point] = rest
         if rest.touches > 1:
             notes.append(f"{grid.name(point)} was touched {rest.touches} times; the last counts")
-    found = torch.full((len(grid), 3), torch.nan, dtype=torch.float64)
+    tips = torch.full((len(grid), 3), torch.nan, dtype=torch.float64)
     for i, rest in enumerate(at):
         if rest is not None:
-            found[i] = torch.tensor(rest.tip, dtype=torch.float64)
-    visited = Visited(at, found, notes)
-    errors = fitted(found, grid)[1]
+            tips[i] = torch.tensor(rest.tip, dtype=torch.float64)
+    visited = Visited(at, tips, notes)
+    errors = fitted(tips, grid)[1]
     if bool((errors > grid.spacing / 2).any()):
         worst = int(errors.nan_to_num(0).argmax())
         rest = at[worst]
@@ -137,8 +137,8 @@ def need_all(visited: Visited, grid: Grid) -> None:
     """Raise ConfigError if points are missing."""
     if missing := visited.missing:
         names = "; ".join(grid.name(i) for i in missing[:5]) + (f"; and {len(missing) - 5} more" if missing[5:] else "")
-        found = len(grid) - len(missing)
-        text = f"found rests at {found} of {len(grid)} points, missing: {names}"
+        count = len(grid) - len(missing)
+        text = f"found rests at {count} of {len(grid)} points, missing: {names}"
         raise ConfigError([f"{text}; record again, or evaluate those that are there with --partial"])
 
 

@@ -48,21 +48,21 @@ def new_rests(settings: MeasureSettings, grid: Grid) -> Rests:
 def measure_still(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
     """Stability, Eq. 3.13 and standard deviation. ConfigError if no two neighbouring frames have a pose."""
     (track,) = tracks
-    told = track.summary(still=True)
-    if "stability" not in told:
-        raise ConfigError([f"{track.source.name}: {told['notes'][-1]}"])
+    tracked = track.summary(still=True)
+    if "stability" not in tracked:
+        raise ConfigError([f"{track.source.name}: {tracked['notes'][-1]}"])
     names = ("frame", "time_s", "tip_x_m", "tip_y_m", "tip_z_m", "tip_sd_m")
     each = zip(range(len(track.poses)), track.log.times, track.log.tips, track.log.deviations, strict=True)
     rows: list[dict[str, Any]] = [dict(zip(names, (i, seconds, *tip, sd), strict=True)) for i, seconds, tip, sd in each]
     caption = "Tip in the camera's frame; gaps are refusals"
-    summary = told["stability"] | {"stated_sd_mm": told["tip_sd_mm"]["median"]}
-    return Result(summary, ("tips.csv", rows), (figures.track_figure(track.log), caption), told["notes"])
+    summary = tracked["stability"] | {"stated_sd_mm": tracked["tip_sd_mm"]["median"]}
+    return Result(summary, ("tips.csv", rows), (figures.track_figure(track.log), caption), tracked["notes"])
 
 
 def measure_grid(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
     """Accuracy over one or several grids. ConfigError if points are missing or the rests do not form the grid."""
     grid = Grid.of(settings)
-    faces, rows, notes, found = [], [], [], {}
+    faces, rows, notes, visits = [], [], [], {}
     for number, track in enumerate(tracks):
         rests = new_rests(settings, grid)
         for seconds, pose in zip(track.log.times, track.poses, strict=True):
@@ -70,7 +70,7 @@ def measure_grid(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
         name = chr(ord("A") + number) if len(tracks) > 1 else track.source.name
         prefix = f"face {name}: " if len(tracks) > 1 else ""
         try:
-            visited = visit(rests.found, grid)
+            visited = visit(rests.completed, grid)
             if not (settings.grid.partial or track.source.live):
                 need_all(visited, grid)
             summary, table = accuracy(visited, grid, track.board)
@@ -80,12 +80,12 @@ def measure_grid(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
         rows += [{"face": name} | row for row in table]
         notes += [prefix + note for note in visited.notes]
         notes += [f"{prefix}no rest at {', '.join(map(str, summary['missing'][:5]))}"] if visited.missing else []
-        found[name] = visited
+        visits[name] = visited
     text = f"{grid.rows} x {grid.columns} points, {1e3 * grid.spacing:g} mm apart"
-    told: dict[str, Any] = {"grid": text, "reference": grid.name(grid.reference), "faces": faces}
-    told["acc_mm"] = fmean(face["acc_mm"] for face in faces)
+    summary: dict[str, Any] = {"grid": text, "reference": grid.name(grid.reference), "faces": faces}
+    summary["acc_mm"] = fmean(face["acc_mm"] for face in faces)
     caption = "Points of the grid, and the tips moved onto them as a rigid body"
-    return Result(told, ("points.csv", rows), (figures.grid_figure(found, grid), caption), notes)
+    return Result(summary, ("points.csv", rows), (figures.grid_figure(visits, grid), caption), notes)
 
 
 def measure_latency(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
@@ -96,23 +96,23 @@ def measure_latency(settings: MeasureSettings, tracks: Sequence[Track]) -> Resul
     times, tips = (torch.tensor(values, dtype=torch.float64) for values in (track.log.times, track.log.tips))
     other_times, other = (torch.tensor(values, dtype=torch.float64) for values in reference)
     try:
-        found = latency(times, tips, other_times, other)
+        lag = latency(times, tips, other_times, other)
     except ValueError as error:
         spans = f"{track.source.name} lasts from {times[0]:.3f} to {times[-1]:.3f} s"
         raise ConfigError([f"{spans}, {path} from {other_times[0]:.3f} to {other_times[-1]:.3f} s: {error}"]) from None
-    summary: dict[str, Any] = {"lag_ms": 1e3 * found.seconds, "sd_ms": 1e3 * found.sd}
-    summary |= {"correlation": found.correlation, "overlap_s": found.overlap}
-    told = track.summary()
-    if "milliseconds" in told:
-        taken = told["milliseconds"]["median"]
+    summary: dict[str, Any] = {"lag_ms": 1e3 * lag.seconds, "sd_ms": 1e3 * lag.sd}
+    summary |= {"correlation": lag.correlation, "overlap_s": lag.overlap}
+    tracked = track.summary()
+    if "milliseconds" in tracked:
+        taken = tracked["milliseconds"]["median"]
         summary |= {"tracker_ms": taken, "total_ms": summary["lag_ms"] + taken}
-    if "stages" in told:
-        summary["stages"] = told["stages"]
+    if "stages" in tracked:
+        summary["stages"] = tracked["stages"]
     curves = {}
     rows = []
-    for name, seconds, places in (("tracker", times, tips), ("reference", other_times, other)):
-        known = places.isfinite().all(-1)
-        distance = 1e3 * (places[known] - places[known][0]).norm(dim=-1)
+    for name, seconds, positions in (("tracker", times, tips), ("reference", other_times, other)):
+        known = positions.isfinite().all(-1)
+        distance = 1e3 * (positions[known] - positions[known][0]).norm(dim=-1)
         curves[name] = (seconds[known], distance)
         pairs = zip(seconds[known].tolist(), distance.tolist(), strict=True)
         rows += [{"curve": name, "time_s": second, "distance_mm": value} for second, value in pairs]

@@ -49,13 +49,13 @@ class Rests:
         spread: Largest spread in metres.
 
     Attributes:
-        found: The rests so far, in the order of time.
+        completed: The rests so far, in the order of time.
     """
 
     def __init__(self, apart: float, *, seconds: float = 0.5, frames: int = 10, spread: float = 0.5e-3):
         self.apart, self.spread = checks.positive("apart", apart, "m"), checks.positive("spread", spread, "m")
         self.seconds, self.frames = checks.positive("seconds", seconds, "s"), checks.whole("frames", frames, 3)
-        self.found: list[Rest] = []
+        self.completed: list[Rest] = []
         self._window: deque[_Sample] = deque()
         self._away: list[_Sample] = []
         self._resting = False
@@ -66,7 +66,7 @@ class Rests:
             return False
         x, y, z = pose.tip.tolist()
         sample = _Sample(seconds, (x, y, z), float(pose.tip_sd))
-        if self._resting and math.dist(sample.tip, self.found[-1].tip) > self.apart:
+        if self._resting and math.dist(sample.tip, self.completed[-1].tip) > self.apart:
             self._away.append(sample)
             if len(self._away) < _AWAY:
                 return False
@@ -86,15 +86,15 @@ class Rests:
         return self._take(rest)
 
     def _take(self, rest: Rest) -> bool:
-        last = self.found[-1] if self.found else None
+        last = self.completed[-1] if self.completed else None
         if last is not None and self._resting:
             if rest.sd < last.sd:  # the calmest part is free of the arrival and the departure
-                self.found[-1] = replace(rest, touches=last.touches)
+                self.completed[-1] = replace(rest, touches=last.touches)
             return False
         if last is not None and math.dist(last.tip, rest.tip) <= self.apart:
-            self.found[-1] = replace(rest, touches=last.touches + 1)
+            self.completed[-1] = replace(rest, touches=last.touches + 1)
         else:
-            self.found.append(rest)
+            self.completed.append(rest)
         self._resting = True
         return True
 

@@ -48,13 +48,13 @@ class Guide:
         """Take a pose. Returns whether all points have been visited."""
         if self._rests(seconds, pose):
             print("\a", end="")
-            if not (complete := len(self._rests.found) >= len(self.grid)):
+            if not (complete := len(self._rests.completed) >= len(self.grid)):
                 self._tell()
             return complete
         return False
 
     def _tell(self) -> None:
-        point = len(self._rests.found)
+        point = len(self._rests.completed)
         tqdm.write(f"point {point + 1} of {len(self.grid)}: {self.grid.name(point)}; hold still")
 
 

@@ -96,8 +96,8 @@ class Track:
         source = self.source
         frames = source.inputs.frames if source.inputs else None
         frames = frames or Frames(source.name, (0, 0), len(self.poses), 0.0, iter(()), list(source.notes))
-        told = summarise(self.log, frames, "ours", still)
-        return told | _timing(source.path)
+        summary = summarise(self.log, frames, "ours", still)
+        return summary | _timing(source.path)
 
 
 def open_source(settings: MeasureSettings, name: str) -> Source:
@@ -162,7 +162,7 @@ def _timing(path: Path | None) -> dict[str, Any]:
     if beside is None or not beside.is_file():
         return {}
     try:
-        told = read_json(beside)
-        return {name: told[name] for name in ("milliseconds", "stages") if name in told}
+        summary = read_json(beside)
+        return {name: summary[name] for name in ("milliseconds", "stages") if name in summary}
     except (OSError, ValueError, TypeError):
         return {}

@@ -78,7 +78,7 @@ def _exact(scene: Scene) -> Tensor:
 
 
 def sweeps() -> list[Sweep]:
-    """Depth, depth range, number of planes, pitch, stride, cone and tolerance of the three ways."""
+    """Depth, depth range, number of planes, pitch, stride, cone and tolerance of the three methods."""
     base = Scene()
     depths = (2e-5, 1e-4, 5e-4, 2e-3, 8e-3, 0.05, 0.5)
     extents = (0.0, 1e-4, 1e-3, 1e-2, 0.02)
@@ -86,42 +86,47 @@ def sweeps() -> list[Sweep]:
     pitches = (0.2e-6, 0.4e-6, 0.5e-6, 0.7e-6, 1e-6, 4e-6, 12e-6)
     cones = "full", "box", "disc", "taper", "band"
     double = replace(base, dtype=torch.complex128)
-    ways = {
+    methods = {
         "AxialHologram": (Scene.axial, ASKED),
         "ConvolutionHologram": (Scene.convolution, DOCUMENTED),
         "plan_hologram": (Scene.planned, ASKED),
     }
-    found = []
-    for name, (way, source) in ways.items():
-        found += [
-            _sweep(name, way, source, "nearest depth (m)", depths, lambda z: replace(base, nearest=z)),
-            _sweep(name, way, source, "depth range (m)", extents, lambda z: replace(base, extent=z)),
-            _sweep(name, way, source, "planes", (1, 2, 5, 20), lambda n: replace(base, planes=n)),
+    listed = []
+    for name, (method, source) in methods.items():
+        listed += [
+            _sweep(name, method, source, "nearest depth (m)", depths, lambda z: replace(base, nearest=z)),
+            _sweep(name, method, source, "depth range (m)", extents, lambda z: replace(base, extent=z)),
+            _sweep(name, method, source, "planes", (1, 2, 5, 20), lambda n: replace(base, planes=n)),
             _sweep(
-                name, way, source, "pitch (m)", pitches,
+                name, method, source, "pitch (m)", pitches,
                 lambda p: replace(base, pitch=p, nearest=1e-4, extent=1e-4, cone="taper" if p > 0.48e-6 else "box"),
             ),
-            _sweep(name, way, source, "cone", cones, lambda c: replace(base, cone=c)),
+            _sweep(name, method, source, "cone", cones, lambda c: replace(base, cone=c)),
             _sweep(
-                name, way, source, "cone, near", cones,
+                name, method, source, "cone, near", cones,
                 lambda c: replace(base, cone=c, nearest=2e-4),
             ),
-            _sweep(name, way, source, "stride (px)", (1, 2, 3, 5), lambda n: replace(base, stride=n)),
+            _sweep(name, method, source, "stride (px)", (1, 2, 3, 5), lambda n: replace(base, stride=n)),
         ]  # fmt: skip
         if source == ASKED:
-            found += [
-                _sweep(name, way, source, "tolerance", tolerances, lambda t: replace(base, tolerance=t)),
+            listed += [
+                _sweep(name, method, source, "tolerance", tolerances, lambda t: replace(base, tolerance=t)),
                 _sweep(
-                    f"{name}, complex128", way, source, "tolerance", tolerances, lambda t: replace(double, tolerance=t)
+                    f"{name}, complex128",
+                    method,
+                    source,
+                    "tolerance",
+                    tolerances,
+                    lambda t: replace(double, tolerance=t),
                 ),
             ]
-    return found
+    return listed
 
 
 def _sweep(
-    name: str, way: Callable[[Scene], Answer], source: str, swept: str, values: tuple, scene: Callable[..., Scene]
+    name: str, method: Callable[[Scene], Answer], source: str, swept: str, values: tuple, scene: Callable[..., Scene]
 ) -> Sweep:
     def exact(value: float | str) -> Tensor:
         return _exact(replace(scene(value), tolerance=DEFAULT, dtype=torch.complex128))
 
-    return Sweep(name, swept, values, lambda v: way(scene(v)), exact, tolerance_from=source)
+    return Sweep(name, swept, values, lambda v: method(scene(v)), exact, tolerance_from=source)

@@ -41,19 +41,19 @@ class Tab:
 
     async def value(self, expression: str) -> Any:
         """Value of a JavaScript expression, which may be a promise. BrowserError if it throws."""
-        found = await self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
-        if "exceptionDetails" in found:
-            raise BrowserError(f"{expression}: {found['exceptionDetails']}")
-        return found["result"].get("value")
+        answer = await self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in answer:
+            raise BrowserError(f"{expression}: {answer['exceptionDetails']}")
+        return answer["result"].get("value")
 
     async def until(self, expression: str, seconds: float = 20.0) -> Any:
         """Wait until the expression is true and return its value. BrowserError if it is not in time."""
         end = asyncio.get_running_loop().time() + seconds
-        while not (found := await self.value(expression)):
+        while not (value := await self.value(expression)):
             if asyncio.get_running_loop().time() > end:
                 raise BrowserError(f"not true within {seconds:g} s: {expression}")
             await asyncio.sleep(0.02)
-        return found
+        return value
 
 
 @asynccontextmanager
@@ -100,11 +100,11 @@ async def browser(folder: Path, size: tuple[int, int] = (800, 600)) -> AsyncIter
         await process.wait()
 
 
-async def _port(told: Path) -> int:
+async def _port(file: Path) -> int:
     """Port of the DevTools, which the browser writes to a file once it has started."""
     end = asyncio.get_running_loop().time() + _LONGEST
-    while not (told.is_file() and len(told.read_text().split()) > 1):
+    while not (file.is_file() and len(file.read_text().split()) > 1):
         if asyncio.get_running_loop().time() > end:
             raise BrowserError(f"{CHROMIUM} did not start within {_LONGEST:g} s")
         await asyncio.sleep(0.02)
-    return int(told.read_text().split()[0])
+    return int(file.read_text().split()[0])

@@ -192,8 +192,9 @@ class PageServer:
             for client in self._clients:
                 client.offer_picture(channel, message)
 
-        with suppress(AttributeError, RuntimeError):  # the server has closed in the meantime
-            self._loop.call_soon_threadsafe(offer)  # type: ignore[union-attr]
+        if (loop := self._loop) is not None:
+            with suppress(RuntimeError):  # the loop has closed in the meantime
+                loop.call_soon_threadsafe(offer)
 
     def _setup(self) -> str:
         message: dict[str, Any] = {"kind": "setup", "frame": self._frame, "catheter": _tool(self._catheter)}

@@ -54,7 +54,7 @@ class RegisteredVolume:
     window: float
 
     def setup(self) -> dict[str, Any]:
-        """What the page is told of the volume, except for the samples."""
+        """Description of the volume for the page, without the samples."""
         values = {name: getattr(self, name) for name in ("low", "high", "level", "window")}
         return values | {"shape": list(self.samples.shape), "matrix": self.texture_from_frame.mT.flatten().tolist()}
 

@@ -24,7 +24,7 @@ def found(tips, refused=(), **criteria) -> list[Rest]:
     rests = Rests(SPACING / 2, **criteria)
     for i, tip in enumerate(tips):
         rests(i / RATE, Pose.refused(Status.NO_CATHETER, "hidden") if i in refused else pose(tip))
-    return rests.found
+    return rests.completed
 
 
 def sheet(rows=3, columns=4):
@@ -72,7 +72,7 @@ def test_a_tip_that_the_tracker_knows_less_well_may_spread_more():
     rests = Rests(SPACING / 2)
     for i, tip in enumerate(tips):
         rests(i / RATE, pose(tip, sd=0.87e-3))
-    assert len(rests.found) == 2
+    assert len(rests.completed) == 2
 
 
 def test_a_point_touched_twice_counts_once_as_it_was_touched_last():

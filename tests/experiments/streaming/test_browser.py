@@ -268,16 +268,22 @@ def in_eye(tip, x: float, width: int, height: int) -> tuple[float, float]:
     return (u + 1) / 2 * width / 2 + (width / 2 if x > 0 else 0), (v + 1) / 2 * height
 
 
+async def immersed(open_tab, server):
+    """A tab in which the session of the emulated headset has started."""
+    tab = await open_tab(server.address, HEADSET)
+    await tab.until("view.state.offset !== null && !document.getElementById('headset').disabled")
+    await tab.value("document.getElementById('headset').click()")
+    await tab.until("view.state.headset === 'immersive-vr'")
+    assert await tab.value("asked") == ["immersive-vr", "viewer"]
+    return tab
+
+
 def test_both_eyes_of_a_headset_see_the_tip_where_it_is(tmp_path):
     """An emulated headset: the session starts, both eyes are drawn with their own matrices, and it ends."""
 
     async def test(server):
         async with browser(tmp_path) as open_tab:
-            tab = await open_tab(server.address, HEADSET)
-            await tab.until("view.state.offset !== null && !document.getElementById('headset').disabled")
-            await tab.value("document.getElementById('headset').click()")
-            await tab.until("view.state.headset === 'immersive-vr'")
-            assert await tab.value("asked") == ["immersive-vr", "viewer"]
+            tab = await immersed(open_tab, server)
             for i in (0, 30, 77, 140):
                 given = pose(i, 4e-3)
                 await shown(server, tab, given)
@@ -340,11 +346,7 @@ def test_alignment_by_a_controller_puts_the_catheter_where_it_is(tmp_path):
 
     async def test(server):
         async with browser(tmp_path) as open_tab:
-            tab = await open_tab(server.address, HEADSET)
-            await tab.until("view.state.offset !== null && !document.getElementById('headset').disabled")
-            await tab.value("document.getElementById('headset').click()")
-            await tab.until("view.state.headset === 'immersive-vr'")
-            assert await tab.value("asked") == ["immersive-vr", "viewer"]
+            tab = await immersed(open_tab, server)
             await tab.value("document.getElementById('align').click()")
             answer: dict = {}
             for i in range(6):

@@ -125,16 +125,16 @@ class GazeTrack:
         """
         added = []
         for each in value if isinstance(value, list) else [value]:
-            found = _sample(each)
-            if isinstance(found, str):
-                self.dropped[found] += 1
-            elif now is not None and abs(found.time - now) > _CLOCK_S:
+            sample = _sample(each)
+            if isinstance(sample, str):
+                self.dropped[sample] += 1
+            elif now is not None and abs(sample.time - now) > _CLOCK_S:
                 self.dropped["clock"] += 1
-            elif found.time <= self.last:
+            elif sample.time <= self.last:
                 self.dropped["out of order"] += 1
             else:
-                self._samples.append(found)
-                added.append(found)
+                self._samples.append(sample)
+                added.append(sample)
         while self._samples and self._samples[0].time < self.last - self._kept_s:
             self._samples.popleft()
         self.accepted += len(added)

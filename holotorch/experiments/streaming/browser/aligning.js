@@ -11,7 +11,7 @@ const OFFERED = [
   [[-0.04, -0.04, 0.50], [-0.50, 0.80, 0.33]], [[0.00, 0.00, 0.46], [-0.45, -0.85, -0.28]],
 ].map(([tip, direction]) => ({ tip, direction: unit(direction) }));
 const FLASH = 0.5;  // seconds
-let told = 0;
+let answered = 0;
 
 const byId = (id) => document.getElementById(id);
 export function offerAlignment(setup) {
@@ -34,11 +34,11 @@ export function aligned() {
 export function takeAlignment(message) {
   const more = !state.alignment || message.count > state.alignment.count;
   state.alignment = message;
-  told = now();
+  answered = now();
   if (more && message.count) offer();
 }
 export function twinColour() {  // green or red for a moment after an answer
-  if (now() - told > FLASH) return [0.9, 0.4, 0.9];
+  if (now() - answered > FLASH) return [0.9, 0.4, 0.9];
   return state.alignment.error ? [1, 0.2, 0.2] : [0.2, 1, 0.3];
 }
 export function alignmentText() {

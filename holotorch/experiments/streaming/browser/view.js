@@ -65,7 +65,7 @@ function scene() {
 }
 
 // ---- words
-let frames = 0, counted = now(), told = 0;
+let frames = 0, counted = now(), written = 0;
 function words() {
   const { pose } = state;
   const reason = !state.connected ? "no connection to the server; trying again"
@@ -88,8 +88,8 @@ function frame() {
     state.rate = frames / (now() - counted);
     [frames, counted] = [0, now()];
   }
-  if (now() - told > 0.1) {
-    told = now();
+  if (now() - written > 0.1) {
+    written = now();
     words();
   }
   requestAnimationFrame(frame);
