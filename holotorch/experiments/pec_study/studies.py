@@ -6,6 +6,7 @@ The chart ``pec`` compares the committed tables with the thesis.
 """
 
 import math
+import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -23,7 +24,8 @@ from holotorch.modulator import quantised
 
 Row = dict[str, Any]
 PI = math.pi
-SIZES = (64, 128, 256, 512)  # pixels of the array along each axis in the study ``scaling``
+SIZES = (64, 128, 256, 512)  # pixels of the array along each axis in the study of times
+ROUNDS = 3  # measurements of each time
 VOLUME = f"synthetic volume, {SLICES} slices in turn"
 DEPTHS = (0.08, 0.10, 0.12)  # distances in metres of the three depths of a scene
 
@@ -89,10 +91,15 @@ def iterations(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) 
 
 
 def scaling(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Thesis Figs. 4.10, 4.11: seconds by sigma and by resolution."""
+    """Thesis Figs. 4.10, 4.11: seconds by sigma and by resolution, the methods in turn and the median of the rounds."""
     settings = [(bench.size, sigma) for sigma in sigmas] + [(size, bench.sigma_px) for size in SIZES]
     for size, sigma in cases.each(settings, desc="time", unit="case"):
-        yield from _methods(replace(bench, size=size, sigma_px=sigma), steps, setting=f"{size} px")
+        setup = replace(bench, size=size, sigma_px=sigma)
+        rounds = [list(_methods(setup, steps, setting=f"{size} px")) for _ in range(ROUNDS)]
+        for row, *others in zip(*rounds, strict=True):
+            seconds = sorted(each["seconds"] for each in (row, *others))
+            spread = round(seconds[-1] / max(seconds[0], 1e-3), 2)
+            yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
 
 
 def focus(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
@@ -227,5 +234,6 @@ def _row(
         **{key: round(scores[key], 4) if key in scores else "" for key in keys},
         "peak_degC_at_630nm": round(scores["peak_rad"] * 175 / PI) if "peak_rad" in scores else "",
         "seconds": round(seconds, 3),
+        "seconds_spread": "",  # longest over shortest, of a study that measures several times
         "count": count,
     }
