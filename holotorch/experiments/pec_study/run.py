@@ -7,6 +7,7 @@ from holotorch.experiments.pec_study.bench import Bench
 from holotorch.experiments.pec_study.cases import Cases
 from holotorch.experiments.pec_study.config import StudySettings
 from holotorch.experiments.pec_study.studies import STUDIES
+from holotorch.experiments.pec_study.times import times_picture
 from holotorch.experiments.runs.figures import curves
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
@@ -46,7 +47,8 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     rows, text = cases.rows, table_text(cases.rows)
     files.write(write_table, folder / "table.csv", rows)
     files.write(write_text, folder / "table.txt", text)
-    picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
+    draw = times_picture if settings.study == "time" else curves
+    picture = draw(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
     summary |= {"rows": len(rows), "seconds": round(cases.seconds, 1), "peak_memory_bytes": peak_memory()}
     complete = conclude(opened, summary, files, done=True)
