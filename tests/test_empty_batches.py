@@ -66,6 +66,7 @@ def test_operators(case: Case):
         (lambda: metrics.grain_size(PICTURE), (0, 3, 2)),
         (lambda: metrics.anisotropy(PICTURE).ratio, (0, 3)),
         (lambda: metrics.sharpness(PICTURE, PICTURE), (0, 3)),
+        (lambda: metrics.dark_spots(PICTURE, PICTURE), (0, 3)),
         (lambda: metrics.seed_statistics(torch.rand(2, 0, 12, 17)).mean, (0, 12, 17)),
         (lambda: tone_map(PICTURE), (0, 3, 12, 17)),
         (lambda: gamut_map(PICTURE), (0, 3, 12, 17)),

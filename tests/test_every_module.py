@@ -8,11 +8,11 @@ import re
 
 import pytest
 import torch
+from host_reads import HostReads
 from modules import CONTRACTS, EXAMPLES, WAVELENGTHS, Example
 from paths import ROOT
 from torch import Tensor, nn
 from torch.func import functional_call
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from holotorch import Grid, metrics
 from holotorch.core.complex import intensity, phasor, wrapped
@@ -198,18 +198,6 @@ READS = {  # on a CPU, where this costs nothing
     "ConvolutionHologram": "asks of each plane whether it has light",
     "AxialHologram": "asks of each plane whether it has light",
 }
-
-
-class HostReads(TorchDispatchMode):
-    """Counts the operations that wait for a number to come back from the device."""
-
-    def __init__(self):
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += func in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten.nonzero.default)
-        return func(*args, **(kwargs or {}))
 
 
 @pytest.mark.parametrize("example", [each for each in EXAMPLES if not each.learned], ids=lambda each: each.name)

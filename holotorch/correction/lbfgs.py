@@ -65,16 +65,15 @@ class LBFGS(Solver):
         largest = run.rows(direction.abs()).amax(-1)
         first_length = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
         length = torch.where(empty, first_length, 1.0)
-        x, loss, after, failed = self._search(run, direction, gradient, length)
+        x, loss, after, failed, turned, going = self._search(run, direction, gradient, length, ascending)
         # A step that fails with a memory may succeed without it; an item whose step fails without a memory has stalled.
         stalled = failed & empty
-        misled = ascending | failed
-        if misled.any():
-            memory.forget(misled.reshape(-1))
+        if turned:
+            memory.forget((ascending | failed).reshape(-1))
         change = after - gradient
         pair = x - run.x, change, self._preconditioned(change)
         memory.add(*(run.rows(part).reshape(flat) for part in pair))
-        run.advance(x, loss, stalled)
+        run.advance(x, loss, stalled, going=going)
         gradient = torch.where(run.each(run.active), after, gradient)
         return {"gradient": gradient, **memory.state()}
 
@@ -90,30 +89,36 @@ class LBFGS(Solver):
         held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
         return (~held).to(x.dtype)
 
-    def _search(self, run: Run, direction: Tensor, gradient: Tensor, length: Tensor):
-        """Halve the step of each item until its loss falls enough; returns x, losses, gradient and which items failed.
+    def _search(self, run: Run, direction: Tensor, gradient: Tensor, length: Tensor, ascending: Tensor):
+        """Halve the step of each item until its loss falls enough.
 
-        Every trial computes the gradient too, because most first trials are accepted.
+        Every trial computes the gradient too, because most first trials are accepted. Returns x, losses, gradient,
+        which items failed, whether any failed or was ``ascending``, and whether any remains active (None if not
+        known).
         """
         slack = 8 * torch.finfo(run.x.dtype).eps * run.loss
         accepted, failed = ~run.active, torch.zeros_like(run.active)
         shortest = length * _SHORTEST
         best, best_loss, best_gradient = run.x, run.loss, gradient
+        first = True
         while True:
             x = run.project(run.x + run.each(length) * direction)
             loss, after = run.value_and_gradient(x)
             decrease = _ARMIJO * run.total(gradient * (x - run.x))
             enough = ~accepted & (loss <= run.loss + decrease + slack)
-            if enough.all():  # usually in the first trial
-                return x, loss, after, failed
+            accepted = accepted | enough
+            failed = ~accepted & (length <= shortest)
+            left, others, turned, going = run.read(
+                ~(accepted | failed), ~enough, ascending | failed, run.remaining(loss, failed)
+            )
+            if not others:  # usually in the first trial
+                return x, loss, after, failed, turned, going
             moved = run.each(enough)
             best, best_gradient = torch.where(moved, x, best), torch.where(moved, after, best_gradient)
             best_loss = torch.where(enough, loss, best_loss)
-            accepted = accepted | enough
-            failed = ~accepted & (length <= shortest)
-            if (accepted | failed).all():
-                return best, best_loss, best_gradient, failed
-            length = torch.where(accepted, length, length * _SHRINK)
+            if not left:
+                return best, best_loss, best_gradient, failed, turned, going if first else None
+            length, first = torch.where(accepted, length, length * _SHRINK), False
 
 
 class _Memory:

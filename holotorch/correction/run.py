@@ -108,6 +108,7 @@ class Run:
         self.steps = torch.zeros_like(loss, dtype=torch.int64)
         self.calm = torch.zeros_like(self.steps)  # steps in a row whose change of loss was within the tolerance
         self.stalled = torch.zeros_like(self.active)
+        self.going: bool | None = None  # whether any item is active, where a step has read that already
         self.resumed: State = {}
         if resume:
             self._restore(resume)
@@ -149,18 +150,30 @@ class Run:
             (gradient,) = torch.autograd.grad(losses.sum(), x)
         return losses.detach(), gradient
 
-    def advance(self, x: Tensor, loss: Tensor, stalled: Tensor) -> None:
-        """Move the active items to ``x``, and stop those that have converged (thesis Eq. 4.36) or stalled."""
-        last = self.loss
+    def read(self, *flags: Tensor) -> list[bool]:
+        """Whether each of some tensors holds a true element, read back from the device as one number."""
+        code = int(sum(flag.any() * 2**bit for bit, flag in enumerate(flags)))
+        return [bool(code & 2**bit) for bit in range(len(flags))]
+
+    def remaining(self, loss: Tensor, stalled: Tensor) -> Tensor:
+        """Which items are still active after :meth:`advance` with these losses."""
+        return self.active & ~stalled & (self._calm(loss) < self.solver.patience) & (loss > 0)
+
+    def _calm(self, loss: Tensor) -> Tensor:
+        settled = (loss - self.loss).abs() < self.solver.tolerance * self.loss  # thesis Eq. 4.36
+        return torch.where(settled, self.calm + 1, 0)
+
+    def advance(self, x: Tensor, loss: Tensor, stalled: Tensor, *, going: bool | None = None) -> None:
+        """Move the active items to ``x``, and stop those that have converged or stalled; ``going`` as the attribute."""
+        last, self.going = self.loss, going
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
         self.x = torch.where(self.each(self.active), x, self.x)  # always, since asking first makes a GPU wait
         loss = torch.where(self.active, loss, last)
+        self.calm = self._calm(loss)
         self.step += 1
         self.losses[self.step] = loss
         self.steps = self.steps + self.active
-        settled = (loss - last).abs() < self.solver.tolerance * last
-        self.calm = torch.where(settled, self.calm + 1, 0)
         self.active = self.active & (self.calm < self.solver.patience) & (loss > 0)
 
     def solution(self, **extra: Tensor) -> Solution:
@@ -240,7 +253,7 @@ class Solver:
         """
         run = Run(self, objective, start, project, resume)
         extra = {name: run.resumed.get(name, value) for name, value in self._begin(run).items()}
-        while run.step < self.max_steps and run.active.any():
+        while run.step < self.max_steps and (run.active.any() if run.going is None else run.going):
             extra = self._advance(run, **extra)
             if callback:
                 callback(run.solution(**extra))

@@ -48,16 +48,19 @@ class APG(Solver):
 
     def _advance(self, run: Run, *, previous: Tensor, step_length: Tensor, count: Tensor) -> State:
         y = run.x + run.each(count / (count + 3)) * (run.x - previous)
-        x, loss, step_length, stalled = self._descend(run, y, step_length)
+        x, loss, step_length, stalled, going = self._descend(run, y, step_length)
         count = count + 1
         if self.restart:
             count = torch.where(loss > run.loss, 0, count)
         previous = run.x
-        run.advance(x, loss, stalled)
+        run.advance(x, loss, stalled, going=going)
         return {"previous": previous, "step_length": step_length * self.grow, "count": count}
 
-    def _descend(self, run: Run, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """One proximal step from ``y``, its length shortened per item until Beck and Teboulle's bound holds."""
+    def _descend(self, run: Run, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, bool]:
+        """One proximal step from ``y``, its length shortened per item until Beck and Teboulle's bound holds.
+
+        Returns the point, its losses, the step lengths, which items stalled, and whether any remains active.
+        """
         value, gradient = run.value_and_gradient(y)
         slack = 8 * torch.finfo(y.dtype).eps * value
         least = self.step * torch.finfo(y.dtype).eps ** 2
@@ -69,11 +72,12 @@ class APG(Solver):
             bound = value + run.total(gradient * moved) + run.total(moved.square()) / (2 * step)
             refused = run.active & ~(loss <= bound + slack)
             stalled = refused & (step <= least)
-            if not (refused & ~stalled).any():
-                # An item whose step was shortened until z = y has stalled as well. An item that does not move in the
-                # first trial is at a minimum on the boundary of the set.
-                stalled = stalled | (shortened & (run.total(moved != 0) == 0))
-                return z, loss, step, stalled
+            # An item whose step was shortened until z = y has stalled as well. An item that does not move in the
+            # first trial is at a minimum on the boundary of the set.
+            unmoved = stalled | (shortened & (run.total(moved != 0) == 0))
+            shorten, going = run.read(refused & ~stalled, run.remaining(loss, unmoved))
+            if not shorten:
+                return z, loss, step, unmoved, going
             step = torch.where(refused, step * self.shrink, step)
             shortened = shortened | refused
 

@@ -2,12 +2,13 @@
 
 from holotorch.metrics.quality import SSIM_WINDOW, PerceptualSimilarity, psnr, ssim, ssim_map
 from holotorch.metrics.seeds import seed_statistics, squared_blur, squared_error
-from holotorch.metrics.speckle import anisotropy, grain_size, power_spectrum, sharpness, speckle_contrast
+from holotorch.metrics.speckle import anisotropy, dark_spots, grain_size, power_spectrum, sharpness, speckle_contrast
 
 __all__ = [
     "SSIM_WINDOW",
     "PerceptualSimilarity",
     "anisotropy",
+    "dark_spots",
     "grain_size",
     "power_spectrum",
     "psnr",

@@ -1,4 +1,4 @@
-"""Speckle contrast, power spectrum, grain size and anisotropy, and sharpness, each measured in a single picture."""
+"""Speckle contrast, power spectrum, grain size and anisotropy, dark spots and sharpness, each of a single picture."""
 
 import math
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from holotorch.core.precision import at_least_single
 
 _BAND = (0.05, 0.25)  # default band of sharpness, in cycles per sample; excludes the coarsest and finest detail
 _LAGS = 16  # lags per sample at which grain_size evaluates the autocorrelation
+_BRIGHT, _DARK = 0.25, 0.25  # of the mean of the reference, and of the reference at the pixel: see dark_spots
 
 
 class Anisotropy(NamedTuple):
@@ -122,6 +123,20 @@ def anisotropy(intensity: Tensor) -> Anisotropy:
     angle = torch.where(angle > math.pi / 2, angle - math.pi, angle)
     least = (half - split).clamp_min(torch.finfo(intensity.dtype).tiny)
     return Anisotropy(torch.sqrt((half + split).clamp_min(least) / least), angle)
+
+
+def dark_spots(intensity: Tensor, reference: Tensor) -> Tensor:
+    """Number of pixels that should be bright and are dark, int64 [...] for intensities [..., H, W] of equal mean.
+
+    A pixel counts where ``reference`` is above a quarter of its mean and ``intensity`` below a quarter of the
+    reference. Such a pixel is an optical vortex, a zero of the field that no small change of the phases removes: the
+    sign of speckle noise in a hologram whose phases began badly (thesis Sec. 4.4.5.2). ValueError for unequal (H, W).
+    """
+    intensity, reference = _picture("intensity", intensity), _picture("reference", reference)
+    if intensity.shape[-2:] != reference.shape[-2:]:
+        raise ValueError(f"pictures must share (H, W), got {tuple(intensity.shape)} and {tuple(reference.shape)}")
+    bright = reference > _BRIGHT * reference.mean((-2, -1), keepdim=True)
+    return (bright & (intensity < _DARK * reference)).sum((-2, -1))
 
 
 def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float] = _BAND) -> Tensor:

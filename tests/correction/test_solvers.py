@@ -1,9 +1,11 @@
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
+from host_reads import HostReads
 from scipy.optimize import nnls
 
 from holotorch import Grid
@@ -233,3 +235,20 @@ def test_a_complex_start_is_named(solver):
     problem, start = pec_problem()
     with pytest.raises(TypeError, match="start must be a real floating-point tensor, got torch.complex128"):
         solver(problem, start.to(torch.complex128))
+
+
+@each_solver
+@pytest.mark.parametrize("weights", [(1.0, 1.0), (0.0, 1.0)], ids=["all active", "one is done"])
+def test_a_step_reads_one_number_back(solver, weights):
+    """Each read makes a GPU wait; a trial that is refused takes another."""
+    problem, start = pec_problem()
+    single = 2 if isinstance(solver, APG) else 1  # evaluations of a step whose first trial is accepted
+    seen: list[tuple[int, int]] = []
+    with HostReads() as reads:
+        replace(solver, max_steps=30, tolerance=0.0)(
+            lambda x: problem(x) * torch.tensor(weights),
+            start,
+            callback=lambda solution: seen.append((solution.evaluations, reads.count)),
+        )
+    steps = [(after[1] - before[1]) for before, after in pairwise(seen) if after[0] - before[0] == single]
+    assert len(steps) > 10 and set(steps) == {1}

@@ -11,6 +11,7 @@ from scipy.special import j1
 
 from holotorch.metrics import (
     anisotropy,
+    dark_spots,
     grain_size,
     power_spectrum,
     seed_statistics,
@@ -185,3 +186,18 @@ def test_refusals():
         sharpness(picture, torch.ones(8, 9))
     with pytest.raises(ValueError, match="0 <= low < high"):
         sharpness(picture, picture, band=(0.2, 0.1))
+
+
+def test_dark_spots_count_vortices_and_nothing_else():
+    y, x = torch.meshgrid(torch.arange(32.0) - 15.7, torch.arange(32.0) - 15.7, indexing="ij")
+    vortex = (x + 1j * y).abs().square()
+    vortex = vortex / (vortex + 4)  # a zero at (15.7, 15.7), 1 far away
+    picture = torch.ones(32, 32)
+    wanted = int((vortex < 0.25).sum())
+    assert 0 < wanted < 10
+    assert dark_spots(torch.stack([vortex, picture, 0.3 * picture]), picture).tolist() == [wanted, 0, 0]
+    half = picture.clone()
+    half[:, :16] = 0.1  # dark in the reference as well: no spot there
+    assert dark_spots(vortex, half).item() == int((vortex[:, 16:] < 0.25).sum())
+    with pytest.raises(ValueError, match="must share"):
+        dark_spots(picture, picture[:16])

@@ -35,9 +35,6 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {  # functions of the central 
     "sled": Spectrum.sled,
     "led": Spectrum.led,
 }
-# Prefactor ``defocus`` of ``optimum_fwhm`` for the aperture ``Observer.detail``, fitted to the CT scan of a teapot.
-# Smooth scenes need a larger one (C60: 0.8).
-BEST = 0.46
 _MAX_RINGS = 16  # largest number of rings of directions of an extended source; 16 rings have 1024 directions
 LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
@@ -224,7 +221,7 @@ class Observer:
         wavelengths = self.scene.settings.wavelengths
         samples = [self.samples(source, wavelength, depth) for wavelength in wavelengths]
         difference = path_difference(depth, self.aperture(depth))
-        best = [optimum_fwhm(each, self.detail(depth, each), depth, defocus=BEST) for each in wavelengths]
+        best = [optimum_fwhm(each, self.detail(depth, each), depth) for each in wavelengths]
         quality = ssim((shown / peak).clamp(0, 1), (reference / peak).expand_as(shown), data_range=1.0)
         return {
             "source": source,
