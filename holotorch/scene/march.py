@@ -59,6 +59,13 @@ class March:
         rows, columns = place.footprint(rays, *box) if box is not None else (range(0), range(0))
         self.window = Window.of(place, rays, rows, columns, torch.empty((), dtype=self.dtype, device=self.device))
 
+    @property
+    def thickest(self) -> float:
+        """Thickness of the thickest slab within the volume, in the smallest distance between voxels."""
+        near, far = self.place.depth_range()
+        thickness = max(min(high, far) - max(low, near) for low, high in self.spans)
+        return max(0.0, thickness) / min(self.place.spacing)
+
     def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
         """Yield the contributions of the planes, front to back; planes without a contribution are left out.
 
@@ -89,6 +96,14 @@ class March:
             weight, after = absorb(before, corrected_opacity(opacity, sampled.length * (1 / unit)))
             transmittance.index_copy_(0, sampled.rays, after)
             yield Step(plane, sampled.rays, weight, colour)
+
+    def picture(self, wanted: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Red, green and blue [3, h, w], and opacity [h, w], summed along each ray; ``wanted`` as in :meth:`steps`."""
+        image, opacity = self.zeros(3), self.zeros(1)
+        for step in self.steps(wanted):
+            image.index_add_(1, step.rays, step.weight * step.colour)
+            opacity.index_add_(1, step.rays, step.weight[None])
+        return self.whole(image), self.whole(opacity)[0]
 
     def amplitudes(
         self, wanted: Tensor | None = None, fill: Callable[[Tensor], Tensor] | None = None

@@ -1,6 +1,7 @@
 """DVRSampler at its borders: the same volume in other ways, what it skips, special volumes, phases, mistakes."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -109,6 +110,7 @@ def test_point_and_slice_readers_agree():
         torch.testing.assert_close(turned, straight, rtol=0, atol=2e-6)
 
 
+@pytest.mark.filterwarnings("ignore:slabs are up to")  # on purpose, for speed
 @pytest.mark.parametrize("name", GEOMETRIES)
 def test_skipping_changes_nothing(name):
     table = transfer((0.0, 0.1, 0.9), unit=0.01)
@@ -253,3 +255,39 @@ def test_mistakes_that_need_the_volume():
         sampler(eye=0.02)(noise(2, 2, 2))
     with pytest.raises(TypeError, match="volume must be a Volume, got Tensor"):
         sampler()(torch.rand(3, 3, 3))
+
+
+@pytest.mark.parametrize("front", ["rising", "falling"])
+@pytest.mark.parametrize("planes", [2, 5, 12])
+def test_the_error_of_thick_slabs_is_predicted_and_warned_of(planes, front):
+    """Against the emission-absorption integral in small steps along each of three lines of voxels."""
+    voxels, width, unit = 48, 10e-3, 1 / 64
+    z = (np.arange(voxels) + 0.5) / voxels
+    lines = np.stack([0.5 + 0.45 * np.sin(rate * z) for rate in (5, 11, 17)])
+    volume = Volume(torch.from_numpy(lines.T[:, None, :].repeat(3, 1).copy()), (1 / voxels, 0.1, 0.1), "relative")
+    transfer = TransferFunction(
+        torch.tensor([0.0, 1.0], dtype=torch.float64),
+        torch.tensor([[1.0, 0.2, 0], [0, 0.6, 1]], dtype=torch.float64),
+        torch.tensor([0.0, 0.1], dtype=torch.float64),
+        unit_distance=unit,
+    )
+    ends = np.linspace(0.1 - width / 2, 0.1 + width / 2, planes + 1)[:: 1 if front == "rising" else -1]
+    rays = Grid((3, 3), 0.1 * width)  # through the middles of the voxels
+    arguments = {"width": width, "distance": 0.1, "early": 0.0, "boundaries": ends.tolist()}
+    sampler = DVRSampler(transfer, rays, ((ends[1:] + ends[:-1]) / 2).tolist(), **arguments)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        pictures = [sampler.render(volume)[0] for _ in range(2)]
+
+    fine = (np.arange(20_000) + 0.5) / 20_000
+    exact = []
+    for line in lines if front == "rising" else lines[:, ::-1]:
+        values = np.interp(fine * voxels - 0.5, np.arange(voxels), line)
+        extinction = -np.log1p(-0.1 * values) / unit / len(fine)
+        weights = np.exp(-np.concatenate([[0.0], extinction.cumsum()[:-1]])) * -np.expm1(-extinction)
+        exact.append(np.stack([1 - values, 0.2 + 0.4 * values, values]) @ weights)
+    wanted = torch.from_numpy(np.stack(exact, 1))[:, None, :].expand(3, 3, 3)
+    error = ((pictures[0] - wanted).norm() / wanted.norm()).item()
+    assert sampler.slab_error(volume) == pytest.approx(error, rel=0.5)
+    assert len(caught) == (error > 0.25), error  # once, although it is rendered twice
+    assert error > 1e-3

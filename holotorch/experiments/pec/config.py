@@ -105,13 +105,18 @@ class NearFieldSettings(Settings):
 
 
 class _SolverSettings(Settings):
-    """Solver settings. A run stops after ``patience`` successive relative changes of the loss below ``tolerance``."""
+    """Solver settings. A run stops after ``patience`` successive relative changes of the loss below ``tolerance``.
+
+    ``reruns``: how often at most a hologram with speckle noise (bright pixels that come out dark) is solved again from
+    other random phases; the one with the fewest is kept.
+    """
 
     kind: Any  # name of the solver, stated by each of the classes below
     max_steps: Count = 400
     tolerance: Annotated[Number, Field(ge=0)] = 1e-3
     patience: Count = 10
     start: Start | None = None
+    reruns: Annotated[int, BeforeValidator(number), Field(ge=0, le=20)] = 0
 
 
 class APGSettings(_SolverSettings):

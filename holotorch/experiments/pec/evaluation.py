@@ -11,7 +11,7 @@ from holotorch.core.complex import intensity
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.weight import zone_scores
-from holotorch.metrics import SSIM_WINDOW, psnr, ssim
+from holotorch.metrics import SSIM_WINDOW, dark_spots, psnr, ssim
 from holotorch.optics import CroppedKernel
 
 
@@ -52,6 +52,7 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     numbers = _scores(experiment, picture, experiment.image) | {
         "frames": len(phase),
         "efficiency": _efficiency(experiment, formed),
+        "dark_spots": [int(count) for count in _per_colour(experiment, _spots(experiment, formed))],
         "peak_phase_rad": spread.max().item(),
         "peak_temperature_rise_K": _per_colour(experiment, warm.amax((0, -2, -1))),
         "mean_temperature_rise_K": _per_colour(experiment, warm.mean((0, -2, -1))),
@@ -71,6 +72,15 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     if weight := experiment.settings.target.weight:
         numbers["zones"] = zone_scores(weight, picture, experiment.image, experiment.lit)
     return Result(_all_colours(experiment, phase.cpu()), picture, isolated, numbers)
+
+
+def speckle_spots(experiment: PECExperiment, phase: Tensor) -> Tensor:
+    """Number of bright pixels that come out dark for heater phases [F, C, H, W], of each lit colour, [C]."""
+    return _spots(experiment, experiment.picture_in(experiment.intensity(phase.double())).cpu())
+
+
+def _spots(experiment: PECExperiment, formed: Tensor) -> Tensor:
+    return dark_spots(formed / formed.mean((-2, -1), keepdim=True), experiment.wanted)
 
 
 def _efficiency(experiment: PECExperiment, formed: Tensor) -> list[float]:

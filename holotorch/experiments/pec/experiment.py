@@ -232,7 +232,7 @@ class PECExperiment:
     def stages(self) -> list[Stage]:
         """The stages of the configured solver in order."""
         kind, crosstalk = self.settings.solver.kind, self.array.crosstalk
-        options = self.settings.solver.model_dump(exclude={"kind", "start"})
+        options = self.settings.solver.model_dump(exclude={"kind", "start", "reruns"})
         if kind == "lbfgs":
             solver = LBFGS(precondition=spread_preconditioner(crosstalk.kernel), **options)
             return penalty_schedule(self.problem, solver, crosstalk.total, self.settings.modulator.max_phase)

@@ -79,6 +79,9 @@ def _verdict(run: RunRecord) -> str:
     if any(corrected["stalled"]):
         stop = "stopped where no step lowered the loss any more, at float precision or in a corner of the limit"
     speckle = ", where a Fourier hologram is speckled" if "isolated" not in corrected else ""
+    spots = sum(corrected.get("dark_spots", ()))
+    if spots:
+        stop += f"; {spots} bright pixels came out dark, which is speckle noise: solver.reruns or solver.start may help"
     fewer = any(method["frames"] < corrected["frames"] for method in run.summary["methods"].values())
     single = " The methods that it is compared with show a single frame." if fewer else ""
     return (

@@ -12,6 +12,7 @@ from holotorch.experiments.pec.evaluation import Result, evaluate
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.progress import Log
 from holotorch.experiments.pec.report import ISOLATED_NAME, METHOD_NAMES
+from holotorch.experiments.pec.reruns import rerun
 from holotorch.experiments.pec.weight import ZONES, eccentricities, weight_map
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
@@ -39,10 +40,17 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
         if solution is None:
             raise KeyboardInterrupt
         seconds = log.seconds
+        attempts: dict[str, Any] = {}
+        try:
+            if settings.solver.reruns and not pressed:
+                solution, seconds, attempts["dark_spots_of_attempts"] = rerun(experiment, solution, seconds)
+        except KeyboardInterrupt:
+            pressed.append(signal.SIGINT)
         with deferred(pressed):  # from here on Ctrl-C takes effect only after the results are saved
             if pressed:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
+            results["corrected"].numbers.update(attempts)
             files.write(save_array, out / "arrays" / "phase.npy", results["corrected"].phase.float())
         for name in settings.report.baselines:
             try:
@@ -69,7 +77,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
 
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
-    free = {"device", "report.baselines"}  # baselines are computed after the solver
+    free = {"device", "report.baselines", "solver.reruns"}  # baselines and reruns are computed after the solver
     if experiment.settings.solver.kind != "lbfgs":  # the stages of L-BFGS depend on max_steps
         free.add("solver.max_steps")
     kept = fingerprint(experiment.settings, {"target.image": (experiment.source,)}, free)

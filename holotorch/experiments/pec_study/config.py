@@ -45,6 +45,7 @@ class StudySettings(Settings):
         "lowpass",
         "multiplexing",
         "iterations",
+        "starts",
         "time",
         "focus",
         "limits",

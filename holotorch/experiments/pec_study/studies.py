@@ -20,12 +20,14 @@ from holotorch.experiments.pec_study.bench import Bench, Track
 from holotorch.experiments.pec_study.cases import Cases
 from holotorch.experiments.pec_study.volume import SLICES, focal_sweep
 from holotorch.experiments.timing import timed
+from holotorch.metrics import dark_spots
 from holotorch.modulator import quantised
 
 Row = dict[str, Any]
 PI = math.pi
 SIZES = (64, 128, 256, 512)  # pixels of the array along each axis in the study of times
 ROUNDS = 3  # measurements of each time
+DRAWS = 12  # random starts of each kind, and as many for a second attempt
 VOLUME = f"synthetic volume, {SLICES} slices in turn"
 DEPTHS = (0.08, 0.10, 0.12)  # distances in metres of the three depths of a scene
 
@@ -123,6 +125,24 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> It
             yield _row(setup, VOLUME, {"error": error}, setting=setting)
 
 
+def starts(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
+    """Thesis Sec. 4.4.5.2: ``error`` is the share of ``count`` results with speckle noise, before and after a rerun."""
+    settings = [(kind, start) for kind in ("fourier", "fresnel") for start in ("hot", "cool", "flat")]
+    for (kind, start), sigma in cases.each(
+        [(each, s) for s in sigmas for each in settings], desc="starts", unit="case"
+    ):
+        setup, noisy, scores = replace(bench, kind=kind, sigma_px=sigma), [], []
+        for seed in range(2 * DRAWS):
+            phase = setup.algorithm2(setup.start(start, seed=seed), steps=steps).x
+            formed = setup.formed(phase)
+            noisy.append(dark_spots(formed / formed.mean((-2, -1), keepdim=True), setup.experiment.wanted) > 0)
+            scores.append(setup.scores(phase, formed)["ssim"])
+        before, after = torch.stack(noisy[:DRAWS]), torch.stack(noisy).unflatten(0, (2, DRAWS)).all(0)
+        for name, share in (("", before), (", one rerun", after)):
+            numbers = {"ssim": sum(scores) / len(scores), "error": share.double().mean().item()}
+            yield _row(setup, f"PPEC, {start} start{name}", numbers, count=share.numel())
+
+
 def limits(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
     """SSIM with limited temperature, a wrong sigma, a weight on the heating power, or heaters of few bits."""
     for sigma in cases.each(sigmas, desc="limits", unit="sigma"):
@@ -181,6 +201,7 @@ STUDIES: dict[str, Callable[[Bench, Sequence[float], int, Cases], Iterator[Row]]
     "lowpass": lowpass,
     "multiplexing": multiplexing,
     "iterations": iterations,
+    "starts": starts,
     "time": scaling,
     "focus": focus,
     "limits": limits,

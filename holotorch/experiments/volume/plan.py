@@ -16,6 +16,7 @@ _FLOP_SECONDS = 4.2e-11  # seconds per operation of a HologramPlan
 _RAY_SECONDS = 1.5e-8  # seconds of rendering per ray and plane
 _BASE_BYTES = 500e6  # memory of the libraries
 _RAY_BYTES = 120  # memory of the renderer per ray
+_COARSE_SLABS = 0.1  # predicted error of a rendering that is noted
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the rendering that estimates how much light is cut off
 
@@ -26,6 +27,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
     rays = math.prod(experiment.rays.shape)
     flops = sum(each.flops for each in plans)
     seconds = settings.report.seeds * (_FLOP_SECONDS * flops + _RAY_SECONDS * rays * len(depths))
+    slab_error = experiment.sampler().slab_error(experiment.volume)
     spectra = [8 * math.prod(each.size) for each in plans]  # bytes
     # While planes are added, each colour holds a sum and a summand; at the end, one spectrum is transformed as well.
     slab = 8 * rays * _SLAB * len(plans)
@@ -39,6 +41,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
             "width_mm": experiment.width * 1e3,
         },
         "planes": len(depths),
+        "slab_error": round(slab_error, 4),
         "depths_mm": [min(depths) * 1e3, max(depths) * 1e3],
         "rays": list(experiment.rays.shape),
         "holograms": [
@@ -59,7 +62,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
         "predicted_peak_bytes": round(peak),
         "device": str(experiment.device),
         "physics": _physics(experiment),
-        "notes": _notes(experiment),
+        "notes": _notes(experiment, slab_error),
     }
 
 
@@ -74,7 +77,8 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide",
         f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
-        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end first",
+        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end first; predicted error of the "
+        f"rendering by slabs this thick: {100 * values['slab_error']:.2g} %",
         f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um; field of view "
         f"{', '.join(f'{angle:.2f}' for angle in physics['field_of_view_deg'])} deg",
     ]
@@ -109,8 +113,13 @@ def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
     }
 
 
-def _notes(experiment: VolumeExperiment) -> list[str]:
+def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     notes = list(dict.fromkeys(note for each in experiment.plans for note in each.notes))
+    if slab_error > _COARSE_SLABS:
+        notes.append(
+            f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: more planes "
+            "(hologram.depths) come closer, at little cost with axial nodes"
+        )
     lost = _lost_light(experiment)
     if lost > 0.005:
         notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
@@ -133,7 +142,8 @@ def _lost_light(experiment: VolumeExperiment) -> float:
     height, width = experiment.rays.extent
     if height >= sides[1] and width >= sides[2]:
         return 0.0
-    middle, half, planes = experiment.distance, sides[0] / 2, 24
+    finest = min(experiment.volume.spacing) / max(experiment.volume.extent) * experiment.width
+    middle, half, planes = experiment.distance, sides[0] / 2, max(24, math.ceil(sides[0] / (4 * finest)))
     coarse = Grid(_COARSE, (sides[1] / _COARSE, sides[2] / _COARSE))
     depths = [middle + half * ((j + 0.5) * 2 / planes - 1) for j in range(planes)]
     geometry = {"width": experiment.width, "distance": middle, "rotation": experiment.rotation}

@@ -16,7 +16,7 @@ _POINTS, _RINGS, _RAYS = 9, 16, 64  # points per axis of the scene; rings of the
 
 @dataclass(frozen=True)
 class SeenLight:
-    """Light of a hologram that enters an eye, from geometrical optics.
+    """Light of a hologram that enters an eye, from geometrical optics and the diffraction at the edge of the window.
 
     Attributes:
         rim: Fraction of the edge of the pupil that is illuminated, 0 to 1; 0 if only the window or the highest
@@ -24,11 +24,13 @@ class SeenLight:
         path_difference: As in ``coherence.path_difference``, in metres; the maximum over points on and off the axis.
         bend: Standard deviation in metres, over the rays of a point, of the part z slope^4 / 8 of their paths that the
             Fresnel model neglects.
+        diffracted: Share of the light that the edges of the window diffract to the edge of a pupil whose ``rim`` is 0.
     """
 
     rim: float
     path_difference: float
     bend: float
+    diffracted: float = 0.0
 
 
 def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None) -> SeenLight:
@@ -73,7 +75,11 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     mean = (shares * neglected).sum((-2, -1), keepdim=True) / shares.sum((-2, -1), keepdim=True).clamp_min(1e-30)
     bend = ((shares * (neglected - mean).square()).sum() / shares.sum().clamp_min(1e-30)).sqrt().item()
     rim = inside[..., -1, :].double().mean().item() if radius <= illuminated else 0.0
-    return SeenLight(rim, spread.max().item(), bend)
+    diffracted = 0.0
+    if rim == 0:  # beyond the lit part the power falls as width / (pi^2 distance), from the edges of a window
+        width = max(centre * abs(second) / (2 * side) for side in sides if side > 0)
+        diffracted = width / (math.pi**2 * max(radius - illuminated, width))
+    return SeenLight(rim, spread.max().item(), bend, diffracted)
 
 
 def select_wavelengths(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
@@ -100,10 +106,11 @@ def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLigh
     """Expected error of ``spectral_image`` that propagates ``count`` of ``places``, relative to the mean image.
 
     The error has two parts. First, the light at the edge of the pupil changes with wavelength like a random walk, by a
-    fraction 2 rim / wavelength of the power per metre of wavelength (``rim`` of ``light``). Every step of the walk is
-    weighted with the power of the wavelengths beyond it that are derived from the same propagated wavelength. Second,
-    the Fresnel model between neighbours neglects the fourth order of the slopes (``bend`` of ``light``). If the light
-    illuminates only small parts of the edge, the true error is only 0.1 to 0.5 times the result.
+    fraction 2 rim / wavelength of the power per metre of wavelength (``rim`` or ``diffracted`` of ``light``). Every
+    step of the walk is weighted with the power of the wavelengths beyond it that are derived from the same propagated
+    wavelength. Second, the Fresnel model between neighbours neglects the fourth order of the slopes (``bend`` of
+    ``light``). If the light illuminates only small parts of the edge, the true error is only 0.1 to 0.5 times the
+    result.
     """
     nodes, nearest = select_wavelengths(places, weights, count)
     share = weights / weights.sum()
@@ -118,7 +125,7 @@ def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLigh
     middle = places.mean().item()
     # The fourth-order phase is proportional to wavelength^3, so its relative change is 3 times that of the wavelength.
     bent = math.sqrt(2) * 2 * math.pi * 3 * light.bend / middle * (share * offsets.abs()).sum().item() / middle
-    return math.hypot(math.sqrt(4 * light.rim * walk / middle), bent)
+    return math.hypot(math.sqrt(4 * max(light.rim, light.diffracted) * walk / middle), bent)
 
 
 def least_followed(

@@ -21,6 +21,7 @@ SWEEP = {"lowpass": "[0.2]"}
 @pytest.mark.parametrize("study", STUDIES)
 def test_every_study_fills_its_folder(study, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(pec_studies, "SIZES", (16, 32))
+    monkeypatch.setattr(pec_studies, "DRAWS", 1)
     monkeypatch.setattr(pec_bench, "PASSES", 3)
     words = [f"configs/pec/studies/{study}.yaml", "images=[camera,coffee]", "size=24", "max_steps=6"]
     words.append(f"sweep={SWEEP.get(study, '[0.66]')}")
@@ -73,7 +74,7 @@ def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
     assert next(line for line in lines if line.startswith("fresnel, sigma 1:")).endswith("(goal 4/1.8: not met)")
     assert lines[-1] == "targets: 32 met of 32"
     summaries = [line for line in lines if re.fullmatch(r"\w+: (\d+ [a-z ]+,? ?)+of \d+", line)]
-    tables = ["reproduction", "lowpass", "multiplexing", "iterations", "time", "focus", "targets"]
+    tables = ["reproduction", "lowpass", "multiplexing", "iterations", "starts", "time", "focus", "targets"]
     assert [line.split(":")[0] for line in summaries] == tables
     for line in summaries:
         assert sum(map(int, re.findall(r"(\d+) [a-z]", line.split(" of ")[0]))) == int(line.split(" of ")[1])
