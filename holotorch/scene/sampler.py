@@ -23,6 +23,7 @@ from holotorch.scene.volume import Volume
 
 PhaseMaps = Tensor | PointPhases
 _FEW_RAYS = 24  # rays along each axis that slab_error follows
+_FARTHEST = 1e-3  # metres between these rays at most
 _MOST_SLABS = 2048  # parts of slabs that it follows them through
 _THICK = 4  # voxels: the error of thicker slabs is predicted in the first call, since it takes 0.1 to 1 s
 _COARSE = 0.25  # relative error of a rendering that is warned of
@@ -167,20 +168,18 @@ class DVRSampler(nn.Module):
         It is the change of some hundred rays spread over the grid when every slab is divided into parts of half a
         voxel. 0 for a volume without visible parts.
         """
-        return self._slab_error(self._placed(volume))
-
-    def _slab_error(self, march: March) -> float:
-        near, far = march.place.depth_range()
-        spans = [(max(low, near), min(high, far)) for low, high in march.spans]
-        parts = min(math.ceil(2 * march.thickest), _MOST_SLABS // len(spans))
-        parts = max(2, parts)
-        shape = tuple(min(_FEW_RAYS, n) for n in self.grid.shape)
+        shape = tuple(
+            min(n, max(_FEW_RAYS, math.ceil(extent / _FARTHEST)))
+            for n, extent in zip(self.grid.shape, self.grid.extent, strict=True)
+        )
         pitch = tuple(step * n / few for step, n, few in zip(self.grid.pitch, self.grid.shape, shape, strict=True))
-        rays = Rays(Grid((shape[0], shape[1]), (pitch[0], pitch[1])), self.depths[0], self.eye)
-        coarse = replace(march, rays=rays, lighting=None)
-        order = range(parts) if march.observer < 0 else range(parts - 1, -1, -1)  # front to back within a slab
+        coarse = replace(self._placed(volume, Grid((shape[0], shape[1]), (pitch[0], pitch[1]))), lighting=None)
+        near, far = coarse.place.depth_range()
+        spans = [(max(low, near), min(high, far)) for low, high in coarse.spans]
+        parts = max(2, min(math.ceil(2 * coarse.thickest), _MOST_SLABS // len(spans)))
+        order = range(parts) if coarse.observer < 0 else range(parts - 1, -1, -1)  # front to back within a slab
         divided = [(a + (b - a) * i / parts, a + (b - a) * (i + 1) / parts) for a, b in spans for i in order]
-        depths = [depth for depth in march.depths for _ in order]
+        depths = [depth for depth in coarse.depths for _ in order]
         with torch.no_grad():
             thick, thin = coarse.picture()[0], replace(coarse, spans=divided, depths=depths).picture()[0]
         norm = thin.norm().item()
@@ -196,11 +195,11 @@ class DVRSampler(nn.Module):
         return march.whole((sums[1] / torch.where(visible, sums[0], 1) * visible)[None])[0]
 
     def _march(self, volume: Volume) -> March:
-        march = self._placed(volume)
+        march = self._placed(volume, self.grid)
         self._warn_of_lost_depth(march)
         if self.checks_slabs and march.thickest > _THICK and not march.learned and not volume.values.is_meta:
             self.checks_slabs = False
-            if (error := self._slab_error(march)) > _COARSE:
+            if (error := self.slab_error(volume)) > _COARSE:
                 warnings.warn(
                     f"slabs are up to {march.thickest:.0f} voxels thick for a scene that varies within them: the "
                     f"rendering is about {error:.0%} off the one with thin slabs; use more planes (slab_error tells)",
@@ -209,7 +208,7 @@ class DVRSampler(nn.Module):
                 )
         return march
 
-    def _placed(self, volume: Volume) -> March:
+    def _placed(self, volume: Volume, grid: Grid) -> March:
         if not isinstance(volume, Volume):
             raise TypeError(f"volume must be a Volume, got {type(volume).__name__}; use Volume(values, spacing, unit)")
         volume, rotation = upright(volume, self.rotation)
@@ -222,7 +221,7 @@ class DVRSampler(nn.Module):
         if eye is not None and not (eye > far if falling else eye < near):
             where = f"beyond {far:g} m" if falling else f"before {near:g} m"
             raise ValueError(f"eye must be in front of all slabs, {where} for these depths, got {eye:g} m")
-        rays, observer = Rays(self.grid, first, eye), 1.0 if falling else -1.0
+        rays, observer = Rays(grid, first, eye), 1.0 if falling else -1.0
         return March(volume, place, self.transfer, self.lighting, rays, self.depths, spans, observer, self.early)
 
     def _warn_of_lost_depth(self, march: March) -> None:
