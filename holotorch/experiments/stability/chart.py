@@ -31,9 +31,8 @@ def stability(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], d
     if quick:
         sweeps = [replace(each, values=each.values[:: max(1, (len(each.values) - 1) // 2)]) for each in sweeps]
     points = [point for sweep in tqdm(sweeps, desc="stability", unit="sweep") for point in sweep.points()]
-    known = [f"{sweep.name}: {sweep.known}" for sweep in sweeps if sweep.known]
     rows, pictures = [row(point) for point in points], {"chart": draw(points)}
-    return rows, {}, pictures, [*verdict(points), *(f"left: {each}" for each in known)]
+    return rows, {}, pictures, verdict(points)
 
 
 def row(point: Point) -> dict[str, Any]:

@@ -93,7 +93,6 @@ class Sweep:
         tolerance: Largest accepted error.
         tolerance_from: ASKED, DOCUMENTED or DEFAULTED.
         error: Difference of ``answer`` and ``exact``.
-        known: Why silent failures of this sweep are left, and what to do about them; "" if there must be none.
     """
 
     method: str
@@ -104,7 +103,6 @@ class Sweep:
     tolerance: float = DEFAULT
     tolerance_from: str = DEFAULTED
     error: Callable[[Tensor, Tensor], float] = relative
-    known: str = ""
 
     @property
     def name(self) -> str:

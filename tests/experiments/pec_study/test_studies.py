@@ -74,7 +74,17 @@ def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
     assert next(line for line in lines if line.startswith("fresnel, sigma 1:")).endswith("(goal 4/1.8: not met)")
     assert lines[-1] == "targets: 32 met of 32"
     summaries = [line for line in lines if re.fullmatch(r"\w+: (\d+ [a-z ]+,? ?)+of \d+", line)]
-    tables = ["reproduction", "photographs", "lowpass", "multiplexing", "iterations", "starts", "time", "focus", "targets"]
+    tables = [
+        "reproduction",
+        "photographs",
+        "lowpass",
+        "multiplexing",
+        "iterations",
+        "starts",
+        "time",
+        "focus",
+        "targets",
+    ]
     assert [line.split(":")[0] for line in summaries] == tables
     for line in summaries:
         assert sum(map(int, re.findall(r"(\d+) [a-z]", line.split(" of ")[0]))) == int(line.split(" of ")[1])
