@@ -14,6 +14,7 @@ from holotorch.experiments.measure.commands import add_measure
 from holotorch.experiments.runs.signals import interruptible
 from holotorch.experiments.streaming.commands import add_stream
 from holotorch.experiments.study_commands import add_study
+from holotorch.experiments.sweep.commands import add_sweep
 from holotorch.experiments.tracking.commands import add_tracking
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -182,6 +183,7 @@ def _parser() -> argparse.ArgumentParser:
     run = command("run", _run, about, parents=[config])
     run.add_argument("--out", type=Path, help="folder of the run (default: runs/CONFIG-001, ...)")
 
+    add_sweep(commands)
     resume = command("resume", _resume, "go on with an interrupted run, as if it had never stopped")
     resume.add_argument("folder", type=Path, metavar="DIR", help="folder of the run")
 

@@ -24,7 +24,7 @@ ROOMS = {
     ],
     "experiments": [
         {"measure"},
-        {"panel", "pec_study", "stability", "tracking_benchmark", "streaming"},
+        {"panel", "sweep", "pec_study", "stability", "tracking_benchmark", "streaming"},
         {"joint"},
         {"eye"},
         {"camera", "network", "pec", "volume", "perception", "propagation", "tracking"},
