@@ -106,6 +106,13 @@ def _new(options: argparse.Namespace) -> int:
     return OK
 
 
+def _keys(options: argparse.Namespace) -> int:
+    from holotorch.experiments.beginnings import keys_text
+
+    print(keys_text(options.kind, options.prefix))
+    return OK
+
+
 def _schema(options: argparse.Namespace) -> int:
     from holotorch.experiments.beginnings import schema
 
@@ -193,6 +200,10 @@ def _parser() -> argparse.ArgumentParser:
     new = command("new", _new, "a configuration to begin with: an example of a kind of experiment")
     new.add_argument("kind", metavar="KIND", help="such as pec, volume, eye")
     new.add_argument("--out", type=Path, help="file to write (default: KIND.yaml)")
+
+    keys = command("keys", _keys, "every key of a kind of experiment, with unit, default and meaning")
+    keys.add_argument("kind", metavar="KIND", help="such as pec, volume, eye")
+    keys.add_argument("prefix", nargs="?", default="", metavar="KEY", help="only this key and those within it")
 
     schema = command("schema", _schema, "JSON Schema of the configurations of a kind, for editors")
     schema.add_argument("kind", metavar="KIND", help="such as pec, volume, eye")
