@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     try:
         # The other commands compute nothing, or handle signals themselves.
-        with interruptible() if options.action in (_run, _resume, _demo, _chart, _export_slm) else nullcontext():
+        with interruptible() if options.action in _INTERRUPTIBLE else nullcontext():
             return options.action(options)
     except ConfigError as error:
         print(error, file=sys.stderr)
@@ -169,6 +169,18 @@ def _export_slm(options: argparse.Namespace) -> int:
     return OK
 
 
+def _export_heaters(options: argparse.Namespace) -> int:
+    from holotorch.experiments.panel.heaters import export_heaters, heaters_text
+
+    out, report = export_heaters(options.folder, options.out, bits=options.bits)
+    print(heaters_text(report))
+    print(out)
+    return OK
+
+
+_INTERRUPTIBLE = (_run, _resume, _demo, _chart, _export_slm, _export_heaters)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="holotorch", description="Differentiable optics for VR and AR displays.")
     parser.add_argument("--version", action="version", version=f"holotorch {__version__}")
@@ -228,6 +240,12 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--out", type=Path, help="folder for the files (default: DIR/slm)")
     export.add_argument("--encoding", help="of a volume: double_phase (default), kinoform, error_diffusion")
     export.add_argument("--format", default="png", help="png (default), bmp, or exr for phases instead of levels")
+
+    about = "heater phases, temperatures and optical phases of a run, as NumPy, CSV and PNG files"
+    heaters = command("export-heaters", _export_heaters, about)
+    heaters.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec or joint")
+    heaters.add_argument("--out", type=Path, help="folder for the files (default: DIR/heaters)")
+    heaters.add_argument("--bits", type=int, default=16, help="resolution of the heaters' drive levels (default: 16)")
 
     add_tracking(commands)
     add_measure(commands)

@@ -24,18 +24,26 @@ class PhasedArray(nn.Module):
     Args:
         wavelengths: In metres, one per channel.
         crosstalk: Spreading of the heat, an operator on heater phases [..., C, H, W].
+        reference_response: Phase per temperature rise at 630 nm, in rad/K; that of the thesis's chip by default.
     """
 
     crosstalk: ThermalCrosstalk
 
-    def __init__(self, wavelengths: float | Sequence[float], crosstalk: ThermalCrosstalk):
+    def __init__(
+        self,
+        wavelengths: float | Sequence[float],
+        crosstalk: ThermalCrosstalk,
+        *,
+        reference_response: float = REFERENCE_RESPONSE,
+    ):
         super().__init__()
+        self.reference_response = checks.positive("reference_response", reference_response, "rad/K")
         self.wavelengths, self.crosstalk = checks.wavelengths(wavelengths), crosstalk
 
     @property
     def response(self) -> tuple[float, ...]:
-        """Phase per temperature rise in rad/K, (pi / 175)(630 nm / wavelength), one value per channel."""
-        return tuple(REFERENCE_RESPONSE * REFERENCE_WAVELENGTH / wavelength for wavelength in self.wavelengths)
+        """Phase per temperature rise in rad/K, one value per channel, inversely proportional to the wavelength."""
+        return tuple(self.reference_response * REFERENCE_WAVELENGTH / wavelength for wavelength in self.wavelengths)
 
     def forward(self, phase: Tensor) -> Tensor:
         """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W]."""

@@ -12,9 +12,11 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from holotorch.experiments.config.meanings import MEANINGS
-from holotorch.experiments.config.settings import metres
+from holotorch.experiments.config.settings import kelvin, metres, radians
 
 _LIMITS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
+# Names of the validators that read units, and of the quantities.
+_QUANTITIES = {metres.__name__: "length", radians.__name__: "phase", kelvin.__name__: "temperature"}
 _UNITS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
 
 
@@ -31,10 +33,10 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
     """All keys of ``model`` and its sections in their order; those of alternative sections come one after the other."""
     for name, field in model.model_fields.items():
         sections = list(_sections(field.annotation))
-        length = _is_length([field.annotation, *field.metadata])
+        quantity = _quantity([field.annotation, *field.metadata])
         if not sections:
-            values = _values(field.annotation, field.metadata, length)
-            yield Key(prefix + name, values, _default(field, length), meaning(model, name))
+            values = _values(field.annotation, field.metadata, quantity)
+            yield Key(prefix + name, values, _default(field, quantity), meaning(model, name))
             continue
         many = "list of sections" if _is_list(field.annotation) else "section"
         inside = " | ".join(dict.fromkeys(_first_line(section) for section in sections))
@@ -92,32 +94,32 @@ def _is_list(annotation: Any) -> bool:
     return typing.get_origin(annotation) is tuple or any(_is_list(each) for each in typing.get_args(annotation))
 
 
-def _is_length(parts: Sequence[Any]) -> bool:
-    """Whether an annotation, or one inside it, is a length in metres."""
+def _quantity(parts: Sequence[Any]) -> str:
+    """Name of the quantity with units that an annotation, or one inside it, stands for; "" for a plain number."""
     for part in parts:
-        if isinstance(part, BeforeValidator) and part.func is metres:
-            return True
-        if _is_length([*typing.get_args(part), *getattr(part, "__metadata__", ())]):
-            return True
-    return False
+        if isinstance(part, BeforeValidator) and (name := _QUANTITIES.get(getattr(part.func, "__name__", ""))):
+            return name
+        if found := _quantity([*typing.get_args(part), *getattr(part, "__metadata__", ())]):
+            return found
+    return ""
 
 
-def _values(annotation: Any, metadata: Sequence[Any], length: bool) -> str:
+def _values(annotation: Any, metadata: Sequence[Any], quantity: str) -> str:
     """What a value may be, in words."""
     origin, inside = typing.get_origin(annotation), typing.get_args(annotation)
     limits = " and ".join(
         f"{sign} {getattr(each, name):g}" for each in _flat(metadata) for name, sign in _LIMITS if hasattr(each, name)
     )
     if origin is typing.Annotated:
-        return _values(inside[0], [*inside[1:], *metadata], length)
+        return _values(inside[0], [*inside[1:], *metadata], quantity)
     if origin is typing.Literal:
         return " | ".join(map(str, inside))
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_values(each, metadata, length) if each is not type(None) else "null" for each in inside)
+        return " or ".join(_values(each, metadata, quantity) if each is not type(None) else "null" for each in inside)
     if origin is tuple:
-        items = [_values(each, (), length) for each in inside if each is not Ellipsis]
+        items = [_values(each, (), quantity) for each in inside if each is not Ellipsis]
         return f"list of {items[0]}" if Ellipsis in inside else f"[{', '.join(items)}]"
-    words = {bool: "true | false", int: "whole number", str: "text", float: "length" if length else "number"}
+    words = {bool: "true | false", int: "whole number", str: "text", float: quantity or "number"}
     return " ".join(filter(None, (words.get(annotation, "value"), limits)))
 
 
@@ -126,8 +128,8 @@ def _flat(metadata: Sequence[Any]) -> Iterator[Any]:
         yield from _flat(each.metadata) if isinstance(each, FieldInfo) else [each]
 
 
-def _default(field: FieldInfo, length: bool) -> str:
-    return "required" if field.default is PydanticUndefined else _yaml(field.default, length)
+def _default(field: FieldInfo, quantity: str) -> str:
+    return "required" if field.default is PydanticUndefined else _yaml(field.default, quantity == "length")
 
 
 def _yaml(value: Any, length: bool) -> str:

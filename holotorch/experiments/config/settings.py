@@ -32,6 +32,29 @@ def metres(value: Any) -> Any:
     return number(value)
 
 
+_PI = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)?)\s*\*?\s*(?:pi|π)")
+_RISE = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:K|degC|°C)")
+
+
+def radians(value: Any) -> Any:
+    """A phase in radians, from a number of them or a text such as 4pi or 2.5 pi."""
+    if isinstance(value, str):
+        if (match := _PI.fullmatch(value.strip())) and match[1] not in ("+", "-"):
+            return float(match[1] or 1) * math.pi
+        raise PydanticCustomError("phase", "expected a phase such as 4pi, or a number of radians")
+    return number(value)
+
+
+def kelvin(value: Any) -> Any:
+    """A temperature rise in kelvin, from a number of them or a text such as 500 degC or 500 K."""
+    if isinstance(value, str):
+        if match := _RISE.fullmatch(value.strip()):
+            return float(match[1])
+        wanted = "expected a temperature above ambient such as 500 degC, or a number of degrees"
+        raise PydanticCustomError("temperature", wanted)
+    return number(value)
+
+
 def number(value: Any) -> Any:
     """The value itself; an error for true and false, which Python takes as numbers."""
     if isinstance(value, bool):
@@ -105,6 +128,8 @@ def _no_path(value: str) -> str:
 Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
+Phase = Annotated[float, BeforeValidator(radians), Field(ge=0.1, le=1000, allow_inf_nan=False)]
+TemperatureRise = Annotated[float, BeforeValidator(kelvin), Field(ge=1, le=1e5, allow_inf_nan=False)]
 Wavelength = Annotated[Length, plausible(WAVELENGTH)]
 Distance = Annotated[Length, plausible(PLANE)]  # from the hologram to an image or a plane, on either side
 Pitch = Annotated[Length, plausible(PITCH)]

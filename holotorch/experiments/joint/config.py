@@ -10,6 +10,7 @@ from holotorch.experiments.config.settings import (
     Count,
     GridSettings,
     Number,
+    Phase,
     Settings,
     Wavelength,
     number,
@@ -35,7 +36,7 @@ class DisplaySettings(GridSettings):
     depth: Depth | None = None
     planes: Annotated[Count, Field(le=64)] = 5
     sigma_px: Annotated[Number, plausible(SIGMA_PX)] = 0.66
-    max_phase: Annotated[Number, Field(ge=0.1, le=1000)] = 4 * math.pi
+    max_phase: Phase = 4 * math.pi
 
 
 class EyeSettings(Settings):

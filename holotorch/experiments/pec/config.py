@@ -1,5 +1,6 @@
 """Settings of a configuration of kind ``pec``, proximity effect correction."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,10 +12,13 @@ from holotorch.core.quantities import SIGMA_PX
 from holotorch.experiments.config.settings import (
     Count,
     Distance,
+    ExistingPath,
     GridSettings,
     Number,
+    Phase,
     Settings,
     Side,
+    TemperatureRise,
     Wavelength,
     existing,
     number,
@@ -75,15 +79,22 @@ class TargetSettings(Settings):
 class ModulatorSettings(Settings):
     """The phased array and the heat that spreads between its pixels.
 
-    ``sigma_px``: width of the heat kernel. ``kernel_size``: taps of the kernel along each axis, by default as many as
-    its width needs. ``max_phase``: upper limit in rad on the phase of every pixel after the heat has spread (4 pi is
-    700 degC at 630 nm); no limit by default, as in the thesis. ``bits``: resolution of the heaters, whose levels
+    ``sigma_px``: width of the heat kernel. ``kernel``: in its place a measured one, a NumPy or CSV file of the
+    temperature rises around one heated pixel, which is the warmest and in the middle, in any unit. ``kernel_size``:
+    taps of the kernel along each axis, by default as many as its width needs. ``max_phase``: upper limit on the phase
+    of every pixel after the heat has spread, such as 4pi (700 degC at 630 nm); no limit by default, as in the thesis.
+    ``max_temperature``: in its place a limit on the temperature of every pixel above ambient, such as 500 degC.
+    ``rad_per_K``: phase per kelvin at 630 nm, by default that of the thesis, pi / 175 K; other wavelengths in inverse
+    proportion. ``bits``: resolution of the heaters, whose levels
     are evenly spaced from 0 to the largest phase. ``power_weight``: weight of the sum of the heater phases in the loss.
     """
 
-    sigma_px: Annotated[Number, plausible(SIGMA_PX), Field(description=SIGMA_MEANING)]
+    sigma_px: Annotated[Annotated[Number, plausible(SIGMA_PX)] | None, Field(description=SIGMA_MEANING)] = None
+    kernel: ExistingPath | None = None
     kernel_size: Annotated[Count, Field(le=401)] | None = None
-    max_phase: Annotated[Number, Field(ge=0.1, le=1000)] | None = None
+    max_phase: Phase | None = None
+    max_temperature: TemperatureRise | None = None
+    rad_per_K: Annotated[Number, Field(ge=1e-5, le=10)] = math.pi / 175
     bits: Annotated[Count, Field(le=16)] | None = None
     power_weight: Annotated[Number, Field(ge=0, le=1e6)] = 0.0
 
@@ -198,9 +209,18 @@ def contradictions(settings: PECSettings) -> Iterator[tuple[Key, str]]:
         yield ("target", "region"), f"expected at most the grid, {shape}, got {region}"
     if region and scored_by_ssim and min(region) < 11:
         yield ("target", "region"), f"expected at least 11 x 11 px for ssim, got {region}"
-    if settings.modulator.max_phase is not None and settings.solver.kind != "lbfgs":
-        message = "only the solver lbfgs keeps a limit; use 'solver={kind: lbfgs}', or leave it out"
-        yield ("modulator", "max_phase"), message
+    chip = settings.modulator
+    if (chip.sigma_px is None) == (chip.kernel is None):
+        got = "both" if chip.kernel else "neither"
+        yield ("modulator", "sigma_px"), f"expected sigma_px, or kernel with a file in its place, got {got}"
+    if chip.kernel is not None and size is not None:
+        yield ("modulator", "kernel_size"), "a measured kernel has the size of its file; leave this out"
+    for name in ("max_phase", "max_temperature"):
+        if getattr(chip, name) is not None and settings.solver.kind != "lbfgs":
+            message = "only the solver lbfgs keeps a limit; use 'solver={kind: lbfgs}', or leave it out"
+            yield ("modulator", name), message
+    if chip.max_phase is not None and chip.max_temperature is not None:
+        yield ("modulator", "max_temperature"), "expected one limit, max_phase or max_temperature"
     several = isinstance(light, NearFieldSettings) and len(light.distance) > 1
     if several and region:
         yield ("target", "region"), "expected one distance beside a region"

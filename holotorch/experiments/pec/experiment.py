@@ -31,6 +31,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.weight import weight_map
 from holotorch.experiments.runs.environment import find_device
+from holotorch.io.heat_kernels import load_heat_kernel
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
@@ -220,10 +221,20 @@ class PECExperiment:
             return deconvolve(self.array.crosstalk, retrieved.x, max_steps=100)
         return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / spread, "flat": 1.0}[self.start]
 
+    @property
+    def limit(self) -> float | None:
+        """Upper limit in rad on the phase after spreading, of all colours; None without one.
+
+        A limit on the temperature is that of the colour whose phase is smallest at this temperature.
+        """
+        chip = self.settings.modulator
+        hottest = chip.max_temperature
+        return chip.max_phase if hottest is None else hottest * min(self.array.response)
+
     def heater_phases(self, solution: Tensor) -> Tensor:
         """Heater phases [F, C, H, W]: the solver's result, rounded to the heater levels and scaled below the limit."""
         phase = solution.detach() if self.settings.frames > 1 else solution.detach()[None]
-        limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
+        limit, bits = self.limit, self.settings.modulator.bits
         if bits is not None:
             phase = quantised(phase, bits)
         # Rounded phases may exceed the limit, so they are scaled last, all levels by the same factor.
@@ -235,7 +246,7 @@ class PECExperiment:
         options = self.settings.solver.model_dump(exclude={"kind", "start", "reruns"})
         if kind == "lbfgs":
             solver = LBFGS(precondition=spread_preconditioner(crosstalk.kernel), **options)
-            return penalty_schedule(self.problem, solver, crosstalk.total, self.settings.modulator.max_phase)
+            return penalty_schedule(self.problem, solver, crosstalk.total, self.limit)
         return [Stage(self.problem(), APG(**options) if kind == "apg" else ProjectedAdam(**options))]
 
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
@@ -258,11 +269,26 @@ def build(settings: PECSettings) -> PECExperiment:
     if not lit.any():
         raise ConfigError([f"target.image: {settings.target.image} is black inside its crop; use target.fit: pad"])
     wavelengths = [length for length, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
-    with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan reports lost heat in a note
-        crosstalk = ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size)
-    array = PhasedArray(wavelengths, crosstalk)
+    array = PhasedArray(wavelengths, _crosstalk(settings), reference_response=settings.modulator.rad_per_K)
     # From a hot start most of the light of an isolated chip misses the window: at 128 px and sigma 0.66 the picture has
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
     isolated = getattr(settings.propagator, "boundary", None) == "isolated"
     start = settings.solver.start or ("flat" if isolated else "hot")
     return PECExperiment(settings, source, lit, array, start, find_device(settings.device))
+
+
+def _crosstalk(settings: PECSettings) -> ThermalCrosstalk:
+    """The spreading of the heat, from the width of a Gaussian or from a measured kernel."""
+    chip = settings.modulator
+    if chip.kernel is not None:
+        try:
+            crosstalk = ThermalCrosstalk.from_patch(load_heat_kernel(chip.kernel))
+        except ValueError as error:
+            raise ConfigError([f"modulator.kernel: {error}"]) from error
+        if any(taps > side for taps, side in zip(crosstalk.kernel.shape, settings.grid.shape, strict=True)):
+            size = f"{crosstalk.kernel.shape[0]} x {crosstalk.kernel.shape[1]}"
+            raise ConfigError([f"modulator.kernel: {size} taps are more than the grid's {settings.grid.shape} px"])
+        return crosstalk
+    assert chip.sigma_px is not None  # ``contradictions`` asks for one of the two
+    with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan reports lost heat in a note
+        return ThermalCrosstalk(chip.sigma_px, chip.kernel_size)

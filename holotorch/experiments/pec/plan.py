@@ -4,9 +4,12 @@ import math
 from dataclasses import asdict
 from typing import Any
 
+import torch
+
 from holotorch.experiments.pec.baselines import PASSES
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
+from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
 # Costs measured on two idle CPU cores, with 128 to 1024 px. An evaluation is one computation of the loss and its
@@ -42,7 +45,9 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
         "propagator": settings.propagator.kind,
         "padding": {"samples": list(padded.shape), "reason": _padding_reason(experiment)},
         **single,
-        "crosstalk": {
+        "crosstalk": _measured(experiment)
+        if settings.modulator.kernel
+        else {
             "sigma_px": settings.modulator.sigma_px,
             "meaning": SIGMA_MEANING,
             "taps": crosstalk.kernel.shape[0],
@@ -72,8 +77,7 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     lines = [
         f"Picture    {settings.target.image}, {colours}, on {height} x {width} px",
         f"Array      {physics['width_mm']:.4g} x {physics['height_mm']:.4g} mm (width x height)",
-        f"Crosstalk  heat spreads with sigma {settings.modulator.sigma_px:g} px over {crosstalk['taps']} taps "
-        f"({crosstalk['reason']}): {SIGMA_MEANING}",
+        _crosstalk_line(crosstalk),
         f"Light      {wavelengths}; field of view {_listed(physics['field_of_view_deg'], '.2f')} deg across",
         f"Propagator {values['propagator']}, {values['padding']['reason']}",
     ]
@@ -116,13 +120,42 @@ _START_REASONS = {
 }
 
 
+def _measured(experiment: PECExperiment) -> dict[str, Any]:
+    """The measured kernel, and the Gaussian that fits it best."""
+    kernel = experiment.array.crosstalk.kernel
+    values = {"kernel": experiment.settings.modulator.kernel, "taps": list(kernel.shape), "total": kernel.sum().item()}
+    try:
+        fitted = ThermalCrosstalk.fitted(kernel)
+    except ValueError:  # a single pixel, or one that is as warm as its surroundings
+        return values
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in kernel.shape)
+    model = torch.exp(-(y[:, None] ** 2 + x**2) / fitted.sigma_px**2)
+    residual = ((model - kernel).norm() / kernel.norm()).item()
+    return values | {"fitted_sigma_px": fitted.sigma_px, "fit_residual": residual}
+
+
+def _crosstalk_line(values: dict[str, Any]) -> str:
+    if "kernel" in values:
+        line = f"Crosstalk  measured kernel {values['kernel']}, {' x '.join(map(str, values['taps']))} px"
+        if "fit_residual" in values:
+            line += (
+                f"; the Gaussian that fits it best has sigma {values['fitted_sigma_px']:.3g} px and leaves "
+                f"{values['fit_residual']:.2g} of it (rms)"
+            )
+        return line
+    return (
+        f"Crosstalk  heat spreads with sigma {values['sigma_px']:g} px over {values['taps']} taps "
+        f"({values['reason']}): {SIGMA_MEANING}"
+    )
+
+
 def _listed(values: list[float], form: str = ".3g") -> str:
     return " / ".join(f"{value:{form}}" for value in values)
 
 
 def _heat(experiment: PECExperiment) -> str:
     """Text on the temperature limit and the resolution of the heaters."""
-    limit, bits = experiment.settings.modulator.max_phase, experiment.settings.modulator.bits
+    limit, bits = experiment.limit, experiment.settings.modulator.bits
     steps = "" if bits is None else f"; heaters with {2**bits} steps"
     if limit is None:
         return "no limit, as in the thesis: the hottest pixel is reported" + steps

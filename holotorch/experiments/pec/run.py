@@ -80,7 +80,10 @@ def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     free = {"device", "report.baselines", "solver.reruns"}  # baselines and reruns are computed after the solver
     if experiment.settings.solver.kind != "lbfgs":  # the stages of L-BFGS depend on max_steps
         free.add("solver.max_steps")
-    kept = fingerprint(experiment.settings, {"target.image": (experiment.source,)}, free)
+    inputs: dict[str, tuple[Any, ...]] = {"target.image": (experiment.source,)}
+    if experiment.settings.modulator.kernel is not None:
+        inputs["modulator.kernel"] = (experiment.array.crosstalk.kernel,)
+    kept = fingerprint(experiment.settings, inputs, free)
     # This entry refuses checkpoints of version 0.1.0, whose joint frames are [C, F, H, W], the same shape if F = C.
     return kept | ({"axes of joint frames": "F, C, H, W"} if experiment.joint else {})
 

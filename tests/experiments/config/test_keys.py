@@ -47,7 +47,8 @@ def test_values_defaults_and_kinds_of_section_are_in_words(capsys):
     assert layout["items"].values == "list of sections" and "items.azimuth_deg" in layout
     assert main(["keys", "pec", "modulator"]) == 0
     out = capsys.readouterr().out
-    assert "modulator.sigma_px: number [required]" in out and "exp(-d^2/sigma^2)" in out and "solver" not in out
+    assert "modulator.max_phase: phase >= 0.1 and <= 1000 or null [null]" in out
+    assert "exp(-d^2/sigma^2)" in out and "solver" not in out
 
 
 @pytest.mark.parametrize(("words", "said"), [(["pek"], "no kind 'pek'"), (["pec", "solvr"], "did you mean 'solver'")])

@@ -1,0 +1,106 @@
+"""An own chip: a measured kernel, its limits in its own units, and files for its heaters."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from holotorch.cli import main
+from holotorch.experiments.registry import load_config
+from holotorch.io.panel_files import read_levels
+
+SMALL = ["configs/pec/fourier.yaml", "grid.shape=[24,20]", "report.baselines=[]", "solver={kind: lbfgs, max_steps: 8}"]
+
+
+def kernel(sigma: float = 0.66, size: int = 5, scale: float = 130.0) -> np.ndarray:
+    y, x = np.mgrid[:size, :size] - size // 2
+    return scale * np.exp(-(y**2 + x**2) / sigma**2)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "csv", "txt"])
+def test_a_measured_gaussian_gives_what_its_sigma_gives(tmp_path, suffix, capsys):
+    path = tmp_path / f"kernel.{suffix}"
+    if suffix == "npy":
+        np.save(path, kernel())
+    else:
+        np.savetxt(path, kernel(), delimiter="," if suffix == "csv" else " ", fmt="%.17g")
+    known = [*SMALL, "modulator={sigma_px: 0.66, kernel_size: 5}"]
+    assert main(["run", *known, "--out", str(tmp_path / "a")]) == 0
+    assert main(["run", *SMALL, f"modulator={{kernel: {path}}}", "--out", str(tmp_path / "b")]) == 0
+    one, other = (np.load(tmp_path / name / "arrays" / "phase.npy") for name in "ab")
+    np.testing.assert_allclose(one, other, rtol=0, atol=2e-3)  # eight steps from phases of 6 rad, in float32
+    plan = json.loads((tmp_path / "b" / "plan.json").read_text())["crosstalk"]
+    assert plan["fitted_sigma_px"] == pytest.approx(0.66, abs=1e-3) and plan["fit_residual"] < 1e-3
+    assert "has sigma 0.66 px" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("kernel.csv", "1,2\n3", "expected a table of temperature rises, a line for each row of pixels"),
+        ("kernel.csv", "0,1,0\n1,2,9\n0,1,0", "heated centre the warmest"),
+        ("kernel.csv", "0,1\n1,2", "two odd sizes"),
+        ("kernel.csv", "0,1,0\n1,nan,1\n0,1,0", "nan"),
+        ("kernel.npy", "no array", "expected a table"),
+        ("kernel.mat", "0", "expected a heat kernel as .npy, .csv or .txt"),
+    ],
+)
+def test_what_is_no_kernel_is_said(tmp_path, name, text, message, capsys):
+    (tmp_path / name).write_text(text)
+    assert main(["check", *SMALL, f"modulator={{kernel: {tmp_path / name}}}"]) == 2
+    error = capsys.readouterr().err
+    assert message.lower() in error.lower() and "modulator.kernel" in error
+
+
+@pytest.mark.parametrize(
+    ("modulator", "message"),
+    [
+        ("{}", "expected sigma_px, or kernel with a file in its place, got neither"),
+        ("{sigma_px: 0.66, max_phase: 4pi, max_temperature: 500 degC}", "expected one limit"),
+        ("{sigma_px: 0.66, max_phase: 500 degC}", "expected a phase such as 4pi"),
+        ("{sigma_px: 0.66, max_temperature: 4pi}", "expected a temperature above ambient such as 500 degC"),
+    ],
+)
+def test_settings_of_a_chip_that_contradict_each_other(modulator, message, capsys):
+    assert main(["check", *SMALL, f"modulator={modulator}"]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("text", "pis"), [("4pi", 4), ("2.5 pi", 2.5), ("pi", 1), ("6.283185307179586", 2)])
+def test_phases_in_units_of_pi(text, pis):
+    settings = load_config(SMALL[0], ["solver={kind: lbfgs}", f"modulator={{sigma_px: 0.66, max_phase: {text}}}"])
+    assert settings.modulator.max_phase == pytest.approx(pis * math.pi, rel=1e-15)
+
+
+def test_heater_files_say_what_they_are_and_agree(tmp_path, capsys):
+    chip = "{sigma_px: 0.66, kernel_size: 5, max_temperature: 300 degC, rad_per_K: 0.03}"
+    run, out = tmp_path / "run", tmp_path / "run" / "heaters"
+    assert main(["run", *SMALL, f"modulator={chip}", "frames=2", "--out", str(run)]) == 0
+    rises = json.loads((run / "summary.json").read_text())["methods"]["corrected"]["peak_temperature_rise_K"]
+    assert main(["export-heaters", str(run), "--bits", "8"]) == 0
+    assert "before the heat spreads" in capsys.readouterr().out
+    report, phase = json.loads((out / "export.json").read_text()), np.load(run / "arrays" / "phase.npy")
+    assert len(report["files"]) == 3 * 2 * 3 and report["frames"] == 2
+    assert report["peak_temperature_K"] == pytest.approx(max(rises), rel=1e-5)
+    assert report["peak_temperature_K"] <= 300 * (1 + 1e-6)
+    taps = torch.from_numpy(kernel(scale=1.0))[None, None]
+    response = [0.03 * 630e-9 / wavelength for wavelength in report["wavelengths_m"]]
+    for entry in report["files"]:
+        frame, colour = entry["frame"], report["wavelengths_m"].index(entry["wavelength_m"])
+        heater = torch.from_numpy(phase[frame, colour]).double()
+        optical = torch.nn.functional.conv2d(heater[None, None], taps, padding=2)[0, 0]
+        wanted = {"heater": heater, "optical": optical, "temperature": optical / response[colour]}[entry["quantity"]]
+        array = np.load(out / entry["files"][0])
+        np.testing.assert_allclose(array, wanted, rtol=1e-5, atol=1e-5)
+        with open(out / entry["files"][1], newline="") as stream:
+            table = [[float(value) for value in row] for row in csv.reader(stream)]
+        np.testing.assert_allclose(table, array, rtol=1e-5, atol=1e-5)
+        levels, about = read_levels(out / entry["files"][2])
+        np.testing.assert_allclose(levels.numpy() * about["step"], array, atol=0.51 * about["step"] + 1e-5)
+        assert (about["unit"], about["quantity"]) == (entry["unit"], entry["quantity"])
+        assert entry["quantity"] != "heater" or levels.int().max() <= 255
+    assert main(["export-heaters", str(run)]) == 2 and "holds files already" in capsys.readouterr().err
+    assert main(["export-heaters", str(tmp_path)]) == 2 and "holds no run" in capsys.readouterr().err
