@@ -92,6 +92,10 @@ def _check(options: argparse.Namespace) -> int:
 
     plan = check(settings)
     print(plan.text)
+    if options.preview is not None:
+        from holotorch.experiments.execute import write_preview
+
+        print(write_preview(settings, options.preview))
     if plan.shortage:
         raise ConfigError([plan.shortage])
     return OK
@@ -207,7 +211,9 @@ def _parser() -> argparse.ArgumentParser:
     resume.add_argument("folder", type=Path, metavar="DIR", help="folder of the run")
 
     about = "validate a configuration, print its plan and physics, compute nothing"
-    command("check", _check, about, parents=[config])
+    check = command("check", _check, about, parents=[config])
+    about = "write a picture of the inputs: of a volume a rendering, its histogram and transfer function"
+    check.add_argument("--preview", type=Path, metavar="FILE.png", help=about)
 
     new = command("new", _new, "a configuration to begin with: an example of a kind of experiment")
     new.add_argument("kind", metavar="KIND", help="such as pec, volume, eye")

@@ -11,7 +11,7 @@ from holotorch.experiments.runs.folder import RunFolder, open_run, tidied
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.processes import joined_processes
 from holotorch.experiments.runs.signals import interruptible
-from holotorch.io.files import write_json
+from holotorch.io.files import write_bytes, write_json
 
 
 def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, bool]:
@@ -52,6 +52,21 @@ def check(settings: Any) -> RunPlan:
     """Plan a run without computing anything."""
     kind = find_kind(settings.experiment)
     return kind.plan(kind.build(settings))
+
+
+def write_preview(settings: Any, path: Path) -> str:
+    """Write a picture of a run's inputs, and say what it shows. ConfigError for a kind without, or a path in use."""
+    kind = find_kind(settings.experiment)
+    if path.exists():
+        raise ConfigError([f"{path} is there already; choose another --preview"])
+    if (shown := kind.preview(kind.build(settings))) is None:
+        raise ConfigError([f"a {settings.experiment} has no preview; only kinds with a volume have one"])
+    picture, text = shown
+    try:
+        write_bytes(path, picture)
+    except OSError as error:
+        raise ConfigError([f"cannot write {path}: {error.strerror}; choose another --preview"]) from None
+    return f"{text}\n{path}"
 
 
 def resume(folder: Path) -> tuple[Path, bool]:

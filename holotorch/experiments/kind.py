@@ -44,6 +44,10 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     def plan(self, experiment: Experiment) -> RunPlan:
         """The methods and the cost of a run, without computing its results."""
 
+    def preview(self, experiment: Experiment) -> tuple[bytes, str] | None:
+        """A quick look at the inputs: a PNG, and lines of text; None for a kind that has none."""
+        return None
+
     def prepare(self, experiment: Experiment) -> None:
         """Raise ConfigError if the run cannot start; called before its folder is created."""
 

@@ -8,6 +8,7 @@ from pydantic_core import PydanticCustomError
 from holotorch.core.quantities import DEPTH, EYE_LENGTH, FOCAL_LENGTH, PUPIL_RADIUS, SPACING
 from holotorch.experiments.config.errors import short
 from holotorch.experiments.config.settings import Count, Length, Number, Settings, existing, number, plausible, several
+from holotorch.experiments.volume.config import TransferSettings, VolumeSource
 from holotorch.io.bundled import find_config
 
 Source = Literal["laser", "narrow_sled", "sled", "led"]
@@ -109,6 +110,8 @@ class SweepSettings(Settings):
 class ObserverSettings(Settings):
     """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
+    ``volume``: a volume of your own in place of the scene's, as in runs of kind volume. ``transfer``: its colours and
+    opacities, as there.
     ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the visible
     depths. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times as
     many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina. If the error of
@@ -120,6 +123,8 @@ class ObserverSettings(Settings):
     experiment: Literal["eye"]
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**62)] = 0
     scene: SceneSettings
+    volume: VolumeSource | None = None
+    transfer: TransferSettings | None = None
     display: Annotated[MagnifyingSettings | PlanarSettings | SphericalSettings, Field(discriminator="kind")]
     eye: EyeSettings = EyeSettings()
     light: LightSettings = LightSettings()

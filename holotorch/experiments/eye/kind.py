@@ -33,6 +33,11 @@ class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
         values["text"] = plan_text(experiment, values)
         return RunPlan(values["text"], values, too_large(values))
 
+    def preview(self, experiment: Observer) -> tuple[bytes, str]:
+        from holotorch.experiments.volume.preview import preview
+
+        return preview(experiment.scene)
+
     def prepare(self, experiment: Observer) -> None:
         from holotorch.experiments.eye.run import visible_surface
 

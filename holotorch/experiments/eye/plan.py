@@ -43,7 +43,7 @@ def plan_values(eye: Observer) -> dict[str, Any]:
     seconds += derived * len(retina) * _DERIVED_SECONDS * pixels * math.log2(pixels)
     peaks = [_BASE_BYTES + _MARGIN * each.memory_bytes + _DERIVED_BYTES * pixels for each in retina]
     return {
-        "scene": settings.scene.config,
+        "scene": _scene(eye),
         "synthetic": scene.synthetic,
         "display": {
             "kind": settings.display.kind,
@@ -64,6 +64,13 @@ def plan_values(eye: Observer) -> dict[str, Any]:
         "predicted_peak_bytes": round(max(volume["predicted_peak_bytes"], *peaks)),
         "geometry": eye_geometry.geometry(eye),
     }
+
+
+def _scene(eye: Observer) -> str:
+    """The volume in words: an own one in the setting of the scene, or the scene's."""
+    scene, own = eye.settings.scene.config, eye.settings.volume
+    words = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
+    return "; ".join(filter(None, (words, volume_plan.preset_note(eye.scene))))
 
 
 def plan_text(eye: Observer, values: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ from holotorch.experiments.runs.pictures import save_picture
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
-from holotorch.experiments.volume.config import VolumeSettings
+from holotorch.experiments.volume.config import VolumeSettings, contradictions
 from holotorch.experiments.volume.run import fingerprint_inputs
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
@@ -46,6 +46,10 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     scene = load_config(path, list(settings.scene.change))
     if not isinstance(scene, VolumeSettings):
         raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {scene.experiment!r}"])
+    own = {name: value for name in ("volume", "transfer") if (value := getattr(settings, name)) is not None}
+    scene = scene.model_copy(update=own)
+    if problems := contradictions(scene):
+        raise ConfigError([f"{'.'.join(map(str, key))}: {words}" for key, words in problems])
     return scene
 
 

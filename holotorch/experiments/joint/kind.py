@@ -36,6 +36,11 @@ class JointKind(ExperimentKind[JointSettings, "JointExperiment"]):
         values = plan_values(experiment)
         return RunPlan(plan_text(experiment, values), values, shortage(values))
 
+    def preview(self, experiment: JointExperiment) -> tuple[bytes, str]:
+        from holotorch.experiments.volume.preview import preview
+
+        return preview(experiment.scene)
+
     def run(self, experiment: JointExperiment, folder: RunFolder) -> bool:
         from holotorch.experiments.joint.run import run_joint
 

@@ -64,6 +64,9 @@ class VolumeSource(Settings):
 class TransferSettings(Settings):
     """Colour and opacity: a preset between the values ``low`` and ``high`` of the volume, a JSON file, or ``points``.
 
+    Without ``low`` and ``high``, a preset lies between Otsu's threshold, which divides the histogram into a dark and a
+    bright part, and the value that 0.1 % of the voxels exceed.
+
     Each point is [value, red, green, blue, opacity]; all but the value are in 0..1. The opacity is that of a path of
     length ``unit_distance``, in units of the longest side of the volume.
     """
@@ -163,7 +166,9 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
         problems.append((("volume",), "expected a path, a scene or a phantom"))
     if sum(item is not None for item in (transfer.preset, transfer.file, transfer.points)) != 1:
         problems.append((("transfer",), "expected one of preset, file or points"))
-    if transfer.preset and (transfer.low is None or transfer.high is None or transfer.low >= transfer.high):
+    if (transfer.low is None) != (transfer.high is None):
+        problems.append((("transfer",), "expected both low and high, or neither: then they follow from the histogram"))
+    if transfer.low is not None and transfer.high is not None and transfer.low >= transfer.high:
         problems.append((("transfer",), "a preset needs low < high, the values of the volume between which it lies"))
     if transfer.points is not None and len(transfer.points) < 2:
         problems.append((("transfer", "points"), "expected at least 2 points"))

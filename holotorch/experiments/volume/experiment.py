@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
 _CATALOGUE = {"teapot": "boston_teapot"}  # names of the thesis that differ from those of the catalogue
+_COUNTED = 1_000_000  # voxels of the histogram at most
 _SMOOTH = 8  # correlation length of smooth phases, in rays
 
 
@@ -106,7 +108,22 @@ class VolumeExperiment:
     @cached_property
     def transfer(self) -> TransferFunction:
         """Transfer function from a value of the volume to colour and opacity."""
-        return _transfer(self.settings.transfer).to(self.device)
+        return _transfer(self.settings.transfer, self.preset_range).to(self.device)
+
+    @cached_property
+    def preset_range(self) -> tuple[float, float] | None:
+        """Values between which a preset lies that the configuration leaves open, from the histogram; None otherwise."""
+        transfer = self.settings.transfer
+        if transfer.preset is None or transfer.low is not None:
+            return None
+        from skimage.filters import threshold_otsu
+
+        values = self.volume.values.detach().flatten()
+        values = values[:: max(1, len(values) // _COUNTED)].double().cpu().numpy()
+        if values.min() == values.max():
+            raise ValueError(f"all voxels have the value {values.min():g}; give transfer.low and transfer.high")
+        low, high = float(threshold_otsu(values)), float(np.quantile(values, 0.999))
+        return (low, high) if low < high else (low, float(values.max()))
 
     def sampler(self, seed: int = 0) -> DVRSampler:
         """The renderer with the random phases of a realisation."""
@@ -235,9 +252,9 @@ def open_volume(source: VolumeSource) -> tuple[Volume, str]:
     return getattr(phantoms, source.phantom)(source.samples, dtype=torch.uint8), reason
 
 
-def _transfer(settings: TransferSettings) -> TransferFunction:
+def _transfer(settings: TransferSettings, preset_range: tuple[float, float] | None) -> TransferFunction:
     if settings.preset:
-        return getattr(transfer_presets, settings.preset)(settings.low, settings.high)
+        return getattr(transfer_presets, settings.preset)(*(preset_range or (settings.low, settings.high)))
     if settings.file:
         return transfer_presets.transfer_from_json(read_bytes(Path(settings.file)).decode("utf-8"))
     assert settings.points is not None

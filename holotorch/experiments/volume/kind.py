@@ -37,6 +37,11 @@ class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
         values = plan_values(experiment)
         return RunPlan(plan_text(experiment, values), values, shortage(values))
 
+    def preview(self, experiment: VolumeExperiment) -> tuple[bytes, str]:
+        from holotorch.experiments.volume.preview import preview
+
+        return preview(experiment)
+
     def run(self, experiment: VolumeExperiment, folder: RunFolder) -> bool:
         from holotorch.experiments.volume.run import run_volume
 

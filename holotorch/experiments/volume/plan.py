@@ -113,6 +113,17 @@ def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
     }
 
 
+def preset_note(experiment: VolumeExperiment) -> str:
+    """Where a preset lies whose values the configuration leaves open; empty for any other transfer function."""
+    if experiment.preset_range is None:
+        return ""
+    low, high = experiment.preset_range
+    return (
+        f"the preset {experiment.settings.transfer.preset} lies between {low:.6g} and {high:.6g}, from the histogram; "
+        "look at it with holotorch check --preview, and give transfer.low and transfer.high for other values"
+    )
+
+
 def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     notes = list(dict.fromkeys(note for each in experiment.plans for note in each.notes))
     if slab_error > _COARSE_SLABS:
@@ -120,6 +131,8 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
             f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: more planes "
             "(hologram.depths) come closer, at little cost with axial nodes"
         )
+    if words := preset_note(experiment):
+        notes.append(words)
     lost = _lost_light(experiment)
     if lost > 0.005:
         notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")

@@ -208,7 +208,7 @@ def test_an_empty_volume_is_black(tmp_path):
         ("volume={}", "volume: expected a path, a scene or a phantom"),
         ("volume={path: no/such.nrrd}", "volume.path: expected a file or folder that exists, got 'no/such.nrrd'"),
         ("volume={scene: tooht}", "did you mean 'tooth'"),
-        ("transfer={preset: bone}", "transfer: a preset needs low < high"),
+        ("transfer={preset: bone, low: 9, high: 3}", "transfer: a preset needs low < high"),
         ("transfer={}", "transfer: expected one of preset, file or points"),
         ("wavelengths=[520 nm]", "wavelengths: expected 3"),
         ("view={lighting: true, scattering: {}}", "view.lighting: expected false with scattering"),

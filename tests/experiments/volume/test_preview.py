@@ -1,0 +1,78 @@
+"""A look at an own volume before any hologram: preview, presets from the histogram, and the same keys in eye runs."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_runs import EYE, VOLUME
+
+from holotorch.cli import main
+from holotorch.experiments.registry import find_kind, load_config
+
+TINY = ["configs/volume/tooth.yaml", VOLUME[2], "device=cpu"]
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A ball of value 200 in air of about 20, and one hot voxel."""
+    z, y, x = np.mgrid[:20, :20, :20] - 9.5
+    values = np.where(z**2 + y**2 + x**2 < 36, 200, 20) + (np.arange(8000).reshape(20, 20, 20) % 3)
+    values[0, 0, 0] = 255
+    np.save(tmp_path / "ball.npy", values.astype(np.uint8))
+    return f"{{path: {tmp_path / 'ball.npy'}, spacing: 1, unit: relative}}"
+
+
+def test_a_preset_without_values_lies_between_air_and_the_brightest(scan, capsys):
+    words = [*TINY, f"volume={scan}", "transfer={preset: bone}"]
+    kind = find_kind("volume")
+    experiment = kind.build(load_config(words[0], words[1:]))
+    assert experiment.preset_range is not None
+    low, high = experiment.preset_range
+    assert 22 <= low < 200 and 200 <= high <= 203  # not the 255 of one voxel of 8000
+    colour, opacity = experiment.transfer(torch.tensor([21.0, 201.0]))
+    assert opacity[0] == 0 < opacity[1]
+    assert main(["check", *words]) == 0
+    assert "the preset bone lies between" in capsys.readouterr().out
+    assert main(["check", *words[:-1], "transfer={preset: bone, low: 3}"]) == 2
+    assert "expected both low and high, or neither" in capsys.readouterr().err
+
+
+def test_a_preview_shows_the_volume_and_its_values(scan, tmp_path, capsys):
+    words = [*TINY, f"volume={scan}", "transfer={preset: bone}", "view={width: 0.1 mm}"]
+    picture = tmp_path / "look.png"
+    assert main(["check", *words, "--preview", str(picture)]) == 0
+    out = capsys.readouterr().out
+    # 904 of 8000 voxels lie in the ball.
+    assert "Values     20 to 255; percentiles 1 %: 20" in out and "99 %: 20" in out and "Visible    11 %" in out
+    pixels = cv2.imread(str(picture))[..., ::-1].astype(float)
+    left = pixels[:, : pixels.shape[1] // 3]
+    black = (left.sum(-1) < 30).mean()
+    assert 0.2 < black < 0.9  # the frame of the rendering is black around the ball, which is not
+    assert main(["check", *words, "--preview", str(picture)]) == 2 and "is there already" in capsys.readouterr().err
+    dark = [*words[:-2], "transfer={points: [[250, 1, 1, 1, 0], [254, 1, 1, 1, 0]]}"]
+    assert main(["check", *dark, "--preview", str(tmp_path / "dark.png")]) == 0
+    assert "the rendering is black" in capsys.readouterr().out
+    assert main(["check", "configs/pec/fourier.yaml", "--preview", str(tmp_path / "no.png")]) == 2
+    assert "has no preview" in capsys.readouterr().err and not (tmp_path / "no.png").exists()
+
+
+def test_an_eye_sees_an_own_volume_by_the_same_keys(scan, tmp_path, capsys):
+    change = EYE[0].removeprefix("scene=")
+    words = ["configs/eye/teapot.yaml", f"scene={change}", *EYE[1:], "seeds=1", "light={sources: [laser]}"]
+    words += ["focus=[2 mm]", "tolerance=0.1", f"volume={scan}"]
+    kind = find_kind("eye")
+    own, shipped = (kind.build(load_config(words[0], words[1:n])) for n in (len(words), len(words) - 1))
+    assert own.scene.volume.shape == (20, 20, 20) != shipped.scene.volume.shape
+    assert own.scene.grid == shipped.scene.grid  # the scene's hologram is kept
+    assert main(["check", *words, "transfer={preset: bone}", "--preview", str(tmp_path / "look.png")]) == 0
+    assert (
+        tmp_path / "look.png"
+    ).is_file() and "ball.npy, with view and hologram of configs/volume/c60.yaml; the preset bone" in (
+        capsys.readouterr().out
+    )
+    assert main(["run", *words, "transfer={preset: bone}", "--out", str(tmp_path / "run")]) == 0
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["status"] == "complete"
+    assert main(["check", *words, "volume={}"]) == 2
+    assert "expected a path, a scene or a phantom" in capsys.readouterr().err
