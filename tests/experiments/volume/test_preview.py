@@ -2,7 +2,6 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,6 +9,7 @@ from tiny_runs import EYE, VOLUME
 
 from holotorch.cli import main
 from holotorch.experiments.registry import find_kind, load_config
+from holotorch.io.images import load_image
 
 TINY = ["configs/volume/tooth.yaml", VOLUME[2], "device=cpu"]
 
@@ -46,7 +46,7 @@ def test_a_preview_shows_the_volume_and_its_values(scan, tmp_path, capsys):
     out = capsys.readouterr().out
     # 904 of 8000 voxels lie in the ball.
     assert "Values     20 to 255; percentiles 1 %: 20" in out and "99 %: 20" in out and "Visible    11 %" in out
-    pixels = cv2.imread(str(picture))[..., ::-1].astype(float)
+    pixels = load_image(picture).movedim(0, -1).numpy() * 255
     left = pixels[:, : pixels.shape[1] // 3]
     black = (left.sum(-1) < 30).mean()
     assert 0.2 < black < 0.9  # the frame of the rendering is black around the ball, which is not
