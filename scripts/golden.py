@@ -35,7 +35,7 @@ SMALL_EYE = [
     SCENE,
     "display={kind: planar, distance: 4 mm}",
     "eye={pupil_radius: 0.1 mm, axial_length: 2 mm}",
-    "tolerance=0.1",
+    "eye.tolerance=0.1",
 ]
 SMALL_STUDY = ["images=[camera]", "size=24", "max_steps=4"]
 # Name: words after ``holotorch run``.

@@ -29,6 +29,7 @@ ROOMS = {
         {"eye"},
         {"camera", "network", "pec", "volume", "perception", "propagation", "tracking"},
         {"runs"},
+        {"planning"},
         {"config"},
     ],
 }

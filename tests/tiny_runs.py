@@ -23,7 +23,7 @@ TIMES = "[{seconds: 0.45}]"
 RUNS: dict[str, list[str]] = {
     "pec": ["pec/fourier.yaml", "grid.shape=[24,20]", "report.baselines=[]", "solver={kind: lbfgs, max_steps: 8}"],
     "volume": ["volume/tooth.yaml", *VOLUME, "device=cpu", "report.seeds=3"],
-    "eye": ["eye/teapot.yaml", *EYE, "seeds=1", "light={sources: [laser]}", "focus=[2 mm]", "tolerance=0.1"],
+    "eye": ["eye/teapot.yaml", *EYE, "seeds=1", "light={sources: [laser]}", "focus=[2 mm]", "eye.tolerance=0.1"],
     "joint": [
         *("joint/teapot.yaml", *VOLUME[:2], "view={width: 0.2 mm}", "frames=3", "steps=6", "device=cpu"),
         "display={shape: [24, 20], pitch: 9 um, distance: 2 mm, depth: 2 mm, planes: 2}",

@@ -54,6 +54,9 @@ def _devices() -> Iterator[tuple[bool, str]]:
         yield True, f"CUDA {i}: {torch.cuda.get_device_name(i)}"
     if not torch.cuda.is_available():
         yield True, "no CUDA device; everything runs on the CPU"
+    from holotorch.experiments.planning.machine import machine_speed, speed_file
+
+    yield True, f"{machine_speed()}; kept in {speed_file()}, delete it to measure anew"
 
 
 def _opencv() -> Iterator[tuple[bool, str]]:

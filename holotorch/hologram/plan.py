@@ -146,12 +146,24 @@ def _transform(samples: float) -> float:
     return 5 * samples * math.log2(max(samples, 2))
 
 
+def convolution_flops(operator: ConvolutionHologram, shape: tuple[int, int]) -> float:
+    """Computing time of a convolution of layers of ``shape`` (h, w), as :attr:`HologramPlan.flops`."""
+    size, count = operator.padded(shape), len(operator.depths)
+    samples, sources = math.prod(size), math.prod(size) / operator.stride**2
+    flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples)
+    return flops + _WAVE * sum(_waves(operator, shape)) + _transform(samples)
+
+
+def _waves(operator: ConvolutionHologram, shape: tuple[int, int]) -> list[int]:
+    """Number of samples of the spherical wave that are computed for each plane."""
+    size = operator.padded(shape)
+    return [math.prod(operator.kernel_samples(depth, shape, size)) for depth in operator.depths]
+
+
 def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
     """Attributes of a :class:`HologramPlan` that depend on the method, for convolution."""
     size, count = operator.padded(shape), len(operator.depths)
     samples, sources = math.prod(size), math.prod(size) / operator.stride**2
-    waves = [math.prod(operator.kernel_samples(depth, shape, size)) for depth in operator.depths]
-    flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples) + _WAVE * sum(waves)
     if operator.cone == "band":  # the error is derived in ``CroppedKernel``
         sine = operator.wavelength / (2 * min(operator.grid.pitch))
         error = 2 * sine**2 / math.sqrt(min(size) / 2)
@@ -162,8 +174,8 @@ def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: t
         "transforms": count,
         "size": size,
         "predicted_error": error,
-        "memory_bytes": round(dtype.itemsize * (3.3 * samples + sources) + 80 * max(waves)),
-        "flops": flops + _transform(samples),
+        "memory_bytes": round(dtype.itemsize * (3.3 * samples + sources) + 80 * max(_waves(operator, shape))),
+        "flops": convolution_flops(operator, shape),
         "reason": f"{count} planes, each with a transform of its sources and half of one for its wave; exact",
         "operator": operator,
     }

@@ -4,6 +4,7 @@ import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
+from holotorch.io.files import cache_folder
 from holotorch.io.volumes import load_volume
 from holotorch.scene.volume import Volume
 
@@ -75,7 +76,7 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     import pooch
 
     entry = PUBLISHED[name]
-    folder = Path(directory) if directory is not None else Path(pooch.os_cache("holotorch"))
+    folder = Path(directory) if directory is not None else cache_folder()
     file = folder / entry.url.rsplit("/", 1)[1]
     try:
         pooch.retrieve(entry.url, known_hash=f"sha512:{entry.sha512}", fname=file.name, path=folder)

@@ -89,6 +89,13 @@ def read_json(path: Path) -> Any:
         raise ValueError("nested too deeply to be read") from None
 
 
+def cache_folder() -> Path:
+    """The folder for files that can be made or fetched again: ``holotorch`` in the user's cache ($XDG_CACHE_HOME)."""
+    import pooch  # takes a while to import, and few commands need it
+
+    return Path(pooch.os_cache("holotorch"))
+
+
 def save_array(path: Path, tensor: Tensor) -> None:
     """Write a tensor as .npy with its dtype, atomically."""
     buffer = io.BytesIO()

@@ -67,22 +67,27 @@ class SphericalSettings(Settings):
 class EyeSettings(Settings):
     """The eye: radius of the pupil, distance from pupil to retina, and whether it has human chromatic aberration.
 
-    ``position``: displacement (y, x) of the eye from the axis, for the perspective from there.
+    ``position``: displacement (y, x) of the eye from the axis, for the perspective from there. ``tolerance``: allowed
+    relative L2 error of the intensity from the propagation to the retina; by default the share of the tolerance of the
+    run, or 0.03 if that has none. If the error of collapsed propagation is larger, light is propagated element by
+    element, which takes 10 to 300 times as long and needs much memory.
     """
 
     pupil_radius: Annotated[Length, plausible(PUPIL_RADIUS)] = 1.5e-3
     axial_length: Annotated[Length, plausible(EYE_LENGTH)] = 24e-3
     chromatic: bool = False
     position: Annotated[tuple[Length, Length], BeforeValidator(several)] = (0.0, 0.0)
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] | None = None
 
 
 class LightSettings(Settings):
     """Sources to compare; laser, narrow_sled, sled and led have an FWHM of 1.4, 5, 10 and 20 nm.
 
     ``tolerance``: allowed error from summing over a few wavelengths instead of the whole spectrum, relative to the rms
-    intensity of a picture. ``extent``: sine of the half angle that each source, a disc, subtends at the hologram;
-    0 for a point source. ``dispersion``: the panel's phases depend on the wavelength, as those of a liquid crystal do.
-    With it, or with an eye beside the axis, every wavelength is propagated.
+    intensity of a picture; by default the share of the tolerance of the run, or 0.02. ``extent``: sine of the half
+    angle that each source, a disc, subtends at the hologram; 0 for a point source. ``dispersion``: the panel's phases
+    depend on the wavelength, as those of a liquid crystal do. With it, or with an eye beside the axis, every wavelength
+    is propagated.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
@@ -91,7 +96,7 @@ class LightSettings(Settings):
         "sled",
         "led",
     )
-    tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.02
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] | None = None
     extent: Annotated[Number, Field(ge=0, lt=0.1)] = 0.0
     dispersion: bool = False
 
@@ -114,10 +119,11 @@ class ObserverSettings(Settings):
     opacities, as there.
     ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the visible
     depths. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times as
-    many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina. If the error of
-    collapsed propagation is larger, light is propagated element by element, which takes 10 to 300 times as long and
-    needs much memory. ``sweep``: sweep of the focus, which finds the focus at which each part of the scene looks
-    sharpest. ``tradeoff``: distances of the scene at which the best spectral width of each colour is determined.
+    many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina, divided between
+    the hologram, the wavelengths (``light.tolerance``) and the propagation to the retina (``eye.tolerance``); without
+    it, these err by at most 1e-3, 0.02 and 0.03. ``sweep``: sweep of the focus, which finds the focus at which each
+    part of the scene looks sharpest. ``tradeoff``: distances of the scene at which the best spectral width of each
+    colour is determined.
     """
 
     experiment: Literal["eye"]
@@ -130,6 +136,6 @@ class ObserverSettings(Settings):
     light: LightSettings = LightSettings()
     focus: Annotated[tuple[Annotated[Positive, plausible(DEPTH)], ...], BeforeValidator(several)] | None = None
     seeds: Annotated[Count, Field(le=64)] = 2
-    tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.03
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] | None = None
     sweep: SweepSettings | None = None
     tradeoff: Annotated[tuple[Annotated[Positive, plausible(DEPTH)], ...], BeforeValidator(several)] = ()

@@ -13,8 +13,10 @@ from holotorch.core.grid import Pair
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.eye.config import ObserverSettings, PlanarSettings, SphericalSettings
 from holotorch.experiments.eye.speckle import grains, relative_speckle
+from holotorch.experiments.planning.tolerance import Budget, Part
+from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import pooled
-from holotorch.experiments.volume.experiment import VolumeExperiment, build
+from holotorch.experiments.volume.experiment import HOLOGRAM, VolumeExperiment, build
 from holotorch.metrics import sharpness, speckle_contrast, ssim
 from holotorch.modulator import phase_scale
 from holotorch.optics.light.coherence import optimum_fwhm, path_difference, predicted_contrast
@@ -36,6 +38,7 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {  # functions of the central 
     "led": Spectrum.led,
 }
 _MAX_RINGS = 16  # largest number of rings of directions of an extended source; 16 rings have 1024 directions
+WAVELENGTHS, RETINA = "wavelengths", "retina"  # parts that share the tolerance of a run, with the hologram
 LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
@@ -51,11 +54,13 @@ class Observer:
         settings: The configuration.
         scene: The volume and its holograms.
         focus: Depths at which the eye is focused in turn, in metres from the hologram.
+        budget: Tolerances of hologram, wavelengths and propagation to the retina.
     """
 
     settings: ObserverSettings
     scene: VolumeExperiment
     focus: tuple[float, ...]
+    budget: Budget = field(compare=False)
     _samples: dict[tuple[str, float, float], tuple[Tensor, Tensor, int]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -110,7 +115,7 @@ class Observer:
         key = (source, wavelength, depth)
         if key not in self._samples:
             # The error of the sum and that of deriving pictures are independent; each may be tolerance / sqrt(2).
-            eye, tolerance = self.eye(depth), self.settings.light.tolerance / math.sqrt(2)
+            eye, tolerance = self.eye(depth), self.budget.share(WAVELENGTHS) / math.sqrt(2)
             half_width = self.scene.width / 2
             light = seen_light(self.scene.grid, wavelength, self.display, eye, reach=half_width)
             if not light.path_difference:
@@ -164,7 +169,7 @@ class Observer:
             sources, wavelengths = self.settings.light.sources, self.scene.settings.wavelengths
             ends = [end for source in sources for each in wavelengths for end in PRESETS[source](each).band()]
             setup = self.scene.grid, (min(ends), max(ends)), self.display, self.eye(depth)
-            tolerance, half_width = self.settings.tolerance, self.scene.width / 2
+            tolerance, half_width = self.budget.share(RETINA), self.scene.width / 2
             try:
                 self._retina_plans[depth] = plan_retina(
                     *setup, tolerance=tolerance, plane=depth, reach=half_width, registered=True
@@ -237,9 +242,13 @@ class Observer:
         }
 
 
-def observer(settings: ObserverSettings, scene_settings) -> Observer:
+def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Observer:
     """Build the scene and resolve the depths of focus. ConfigError if nothing is visible or the eye cannot focus."""
-    scene = build(scene_settings)
+    budget = _budget(settings, scene_settings)
+    # An eye sees the hologram itself: the tolerance of a scene, too, is that of its hologram alone.
+    hologram = scene_settings.hologram.model_copy(update={"tolerance": budget.share(HOLOGRAM)})
+    scene = build(scene_settings.model_copy(update={"hologram": hologram, "tolerance": None}))
+    budget.predict(HOLOGRAM, max(plan.predicted_error for plan in scene.plans))
     focus = settings.focus
     if focus is None:
         depth = scene.sampler().depth_map(scene.volume)
@@ -247,7 +256,7 @@ def observer(settings: ObserverSettings, scene_settings) -> Observer:
         if not len(visible):
             raise ConfigError(["scene: nothing of the volume is visible; change its transfer function"])
         focus = tuple(visible[round(share * (len(visible) - 1))].item() for share in (0.1, 0.5, 0.9))
-    result = Observer(settings, scene, focus)
+    result = Observer(settings, scene, focus, budget)
     for depth in focus:
         try:
             result.eye(depth)
@@ -260,3 +269,13 @@ def observer(settings: ObserverSettings, scene_settings) -> Observer:
             except ValueError as error:
                 raise ConfigError([f"eye.position: {error}"]) from error
     return result
+
+
+def _budget(settings: ObserverSettings, scene: VolumeSettings) -> Budget:
+    given = scene.hologram.tolerance or scene.tolerance
+    parts = [
+        Part(HOLOGRAM, 1e-3, "the scene's tolerance", given),
+        Part(WAVELENGTHS, 0.02, "light.tolerance", settings.light.tolerance),
+        Part(RETINA, 0.03, "eye.tolerance", settings.eye.tolerance),
+    ]
+    return Budget(settings.tolerance, parts)

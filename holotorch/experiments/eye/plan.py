@@ -4,14 +4,15 @@ import math
 from typing import Any
 
 from holotorch.experiments.eye import geometry as eye_geometry
-from holotorch.experiments.eye.experiment import Observer
+from holotorch.experiments.eye.experiment import RETINA, Observer
+from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.runs.memory import shortage
 from holotorch.experiments.runs.page import plain
 from holotorch.experiments.volume import plan as volume_plan
 from holotorch.optics.viewing.imaging import retinal_scale
 
-# Costs measured on two CPU cores.
-_FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}  # seconds per floating-point operation, by method
+# Costs on one core of the reference machine of ``planning.machine``.
+FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}  # seconds per floating-point operation, by method
 _DERIVED_SECONDS = 1e-9  # seconds / (n log2 n) to derive a picture of n samples from that at another wavelength
 _BASE_BYTES = 600e6  # bytes of libraries, holograms of 512 px, and pictures of the report
 _MARGIN = 1.1  # factor on the memory of a propagation: derived pictures need a margin around the picture
@@ -36,11 +37,18 @@ def plan_values(eye: Observer) -> dict[str, Any]:
     images = references * len(wavelengths) + pictures(propagated)
     derived = pictures(counts) - pictures(propagated)
     retina = [eye.retina(depth) for depth in eye.focus]
-    volume = volume_plan.plan_values(scene)
-    seconds = volume["predicted_seconds"] / scene.settings.report.seeds * (references + settings.seeds)
-    seconds += images * sum(each.flops * _FLOP_SECONDS[each.method] for each in retina)
-    pixels = math.prod(scene.grid.shape)
-    seconds += derived * len(retina) * _DERIVED_SECONDS * pixels * math.log2(pixels)
+    eye.budget.predict(RETINA, max(each.predicted_error for each in retina))
+    volume, machine, pixels = volume_plan.plan_values(scene), machine_speed(scene.device), math.prod(scene.grid.shape)
+    fft = machine.fft(pixels)
+    seconds = {
+        "holograms": volume_plan.hologram_seconds(scene, machine) * (references + settings.seeds),
+        "pictures": fft
+        * (
+            images * sum(each.flops * FLOP_SECONDS[each.method] for each in retina)
+            + derived * len(retina) * _DERIVED_SECONDS * pixels * math.log2(pixels)
+        ),
+        "start-up and figures": machine.around(figures=2 + len(retina)),
+    }
     peaks = [_BASE_BYTES + _MARGIN * each.memory_bytes + _DERIVED_BYTES * pixels for each in retina]
     return {
         "scene": _scene(eye),
@@ -54,13 +62,14 @@ def plan_values(eye: Observer) -> dict[str, Any]:
         "accommodation_mm": [eye.accommodation(depth) * 1e3 for depth in eye.focus],
         "retinal_scale": [float(retinal_scale(display, eye.eye(depth), depth)) for depth in eye.focus],
         "aperture": [eye.aperture(depth) for depth in eye.focus],
-        "tolerance": settings.tolerance,
+        **eye.budget.values(),
         "retina": [{key: getattr(plan, key) for key in _RETINA} for plan in retina],
         "wavelengths": counts,
         "followed": propagated,
         "directions": directions,
         "images": images * len(eye.focus),
-        "predicted_seconds": round(seconds, 1),
+        "predicted_seconds": round(sum(seconds.values()), 1),
+        "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
         "predicted_peak_bytes": round(max(volume["predicted_peak_bytes"], *peaks)),
         "geometry": eye_geometry.geometry(eye),
     }
@@ -104,8 +113,10 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         f"Light      {light}{others}{directions}",
         f"Phases     {settings.seeds} realisation(s) of the random phases, compared with the mean of "
         f"{8 * settings.seeds} others",
-        f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {values['images']} images, "
-        f"without start-up and figures; {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
+        eye.budget.text,
+        f"Cost       about {values['predicted_seconds']:.2g} s for {values['images']} images "
+        f"({seconds_in_words(values['seconds_of'])}); "
+        f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     if sweep := settings.sweep:
         lines.append(

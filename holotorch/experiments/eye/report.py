@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from holotorch.experiments.planning.errors import error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -37,6 +38,8 @@ def eye_section(run: RunRecord) -> list[str]:
     names = [key.replace("_", " ") + (at if isinstance(first[key], list) else "") for key in first]
     parts.append(table(names, [[_cell(value) for value in row.values()] for row in summary["rows"]]))
     parts.append(element("p", _PREDICTED))
+    if words := error_sentence(summary):
+        parts.append(element("p", words))
     return [*parts, element("h2", "Plan"), element("pre", plan.get("text", plain(plan)))]
 
 

@@ -16,8 +16,10 @@ from holotorch.experiments.eye import geometry as eye_geometry
 from holotorch.experiments.eye import speckle as eye_speckle
 from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import LIT, Observer
+from holotorch.experiments.eye.measured import observer_errors
 from holotorch.experiments.eye.report import by_wavelength
 from holotorch.experiments.eye.tradeoff import WHITE, fitted_prefactor, in_words, tradeoff
+from holotorch.experiments.planning.errors import error_values
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
@@ -64,6 +66,7 @@ def visible_surface(eye: Observer) -> eye_focus.Surface | None:
 def run_observer(eye: Observer, opened: RunFolder) -> bool:
     """Compute the observer's view and fill the folder; True if the run is complete."""
     settings, folder, files, done = eye.settings, opened.path, Results(), False
+    errors: dict[str, Any] = {}
     values, surface = opened.plan.values, visible_surface(eye)
     (folder / "arrays").mkdir(exist_ok=True)
     files.write(write_bytes, folder / "images" / "geometry.png", eye_geometry.draw(eye))
@@ -80,6 +83,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
             files.write(write_table, folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
             print("\n".join(in_words(cases)))
         done = True
+        errors = error_values(observer_errors(eye))
     except KeyboardInterrupt:
         if not views.references:
             raise
@@ -89,7 +93,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
             opened.write_page = None  # there is nothing to show yet
             return conclude(opened, summary, files, done=False, checkpoint=views.checkpoint)
         summary |= _write(folder, eye, views, values, files)
-        summary |= {"seconds": round(views.seconds, 2), "peak_memory_bytes": peak_memory()}
+        summary |= errors | {"seconds": round(views.seconds, 2), "peak_memory_bytes": peak_memory()}
         return conclude(opened, summary, files, done=done, checkpoint=views.checkpoint)
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.planning.machine import machine_speed
 from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.optics.viewing.pupil_views import View, view_padding
 
@@ -32,6 +33,7 @@ def plan_values(experiment: JointExperiment) -> dict[str, Any]:
     transforms = settings.frames * len(settings.wavelengths) * views
     samples = math.prod(padded.shape)
     seconds = settings.steps * transforms * _SAMPLE_SECONDS * samples * math.log2(samples)
+    seconds *= machine_speed(experiment.device).fft(samples)
     seconds *= 1 + sum(_RUNS[name] for name in settings.report.baselines)
     peak = _BASE_BYTES + _SAMPLE_BYTES * transforms * samples + experiment.scene.volume.values.nbytes
     return {
@@ -68,7 +70,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",
         f"Solver     L-BFGS, {settings.steps} steps; compared with {', '.join(settings.report.baselines) or 'nothing'}",
-        f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores, without start-up and figures; "
+        f"Cost       about {values['predicted_seconds']:.2g} s, without start-up and figures; "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     return "\n".join(lines + [f"Note       {note}" for note in values["notes"]])

@@ -9,11 +9,12 @@ import torch
 from holotorch.experiments.pec.baselines import PASSES
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
+from holotorch.experiments.planning.machine import machine_speed
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
-# Costs measured on two idle CPU cores, with 128 to 1024 px. An evaluation is one computation of the loss and its
-# gradient. Predicted times are right within a factor of 2, predicted memory within 30 %.
+# Costs on two idle cores of the reference machine of ``planning.machine``, with 128 to 1024 px. An evaluation is one
+# computation of the loss and its gradient. Predicted memory is right within 30 %.
 _PIXEL_SECONDS = 8e-9  # seconds of an evaluation per pixel, colour and frame
 _FFT_SECONDS = 0.8e-9  # seconds of an evaluation / (n log2 n) for n padded samples
 _BASE_BYTES = 450e6  # bytes of the interpreter with its libraries
@@ -30,7 +31,9 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
     samples *= max(1, (1 + len(experiment.distances)) // 2)
     evaluations = (2 if settings.solver.kind == "apg" else 1) * settings.solver.max_steps
     work = evaluations + PASSES / settings.frames * len(settings.report.baselines)
-    seconds = work * (_PIXEL_SECONDS * pixels + _FFT_SECONDS * samples * math.log2(max(2, samples)))
+    machine = machine_speed(experiment.device)
+    transforms = _FFT_SECONDS * samples * math.log2(max(2, samples)) * machine.fft(math.prod(padded.shape))
+    seconds = work * (_PIXEL_SECONDS * pixels * machine.elementwise + transforms)
     solver_bytes, evaluation_bytes = _SOLVER_BYTES * samples, 0
     if experiment.distances:
         evaluation_bytes = 16 * samples + _EVALUATION_BYTES * 5 * math.prod(grid.shape)
@@ -104,8 +107,8 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         f"Heat       {values['heat']}",
         f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
         f"{values['start']['kind']} start ({values['start']['reason']})",
-        f"Cost       about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s on two "
-        f"idle cores, {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
+        f"Cost       about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s, without "
+        f"start-up and figures, {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     lines += [f"Note       {note}" for note in values["notes"]]
     return "\n".join(lines)

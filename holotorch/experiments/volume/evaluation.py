@@ -2,17 +2,18 @@
 
 import math
 from typing import Any
+from warnings import catch_warnings
 
 import torch
 from torch import Tensor
 
+from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import intensity
 from holotorch.correction.problem import best_scale
-from holotorch.experiments.volume.experiment import VolumeExperiment
+from holotorch.experiments.volume.experiment import REFOCUSING, VolumeExperiment
 from holotorch.hologram import refocused
 from holotorch.metrics import SSIM_WINDOW, ssim
 
-_TOLERANCE = 3e-3  # relative L2 error of the propagation to the refocused pictures
 _BRIGHT = 0.25  # fraction of the brightest pixel of the rendering above which the speckle of a pixel is measured
 VISIBLE = 0.05  # opacity above which a ray shows part of the volume
 
@@ -44,9 +45,11 @@ class VolumeEvaluation:
     def add(self, hologram: Tensor) -> None:
         """Refocus the hologram [3, H, W] of another realisation and add its pictures to the sums."""
         experiment, stride = self.experiment, self.experiment.stride
+        tolerance = experiment.budget.share(REFOCUSING)
         for f, depth in enumerate(self.depths):
             for colour, wavelength in enumerate(experiment.settings.wavelengths):
-                field = refocused(hologram[colour], experiment.grid, wavelength, depth, tolerance=_TOLERANCE)
+                with catch_warnings(action="ignore", category=SamplingWarning):  # the plan states the error
+                    field = refocused(hologram[colour], experiment.grid, wavelength, depth, tolerance=tolerance)
                 self.sums[f, colour] += pooled(intensity(field), stride).cpu()
         self.count += 1
 

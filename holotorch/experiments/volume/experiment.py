@@ -13,12 +13,15 @@ from torch import Tensor
 
 from holotorch.core.grid import Grid
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.planning.tolerance import Budget
+from holotorch.experiments.planning.tolerance import Part as ErringPart
 from holotorch.experiments.runs.environment import find_device
 from holotorch.experiments.volume.config import TransferSettings, VolumeSettings, VolumeSource
 from holotorch.hologram import AxialHologram, ConvolutionHologram, HologramPlan, plan_hologram
 from holotorch.io.catalogue import PUBLISHED, fetch_volume
 from holotorch.io.files import read_bytes
 from holotorch.io.volumes import load_volume
+from holotorch.optics import plan_propagation
 from holotorch.scene import phantoms, transfer_presets
 from holotorch.scene.adaptive import sample_adaptively
 from holotorch.scene.layers import SourceLayers
@@ -30,6 +33,8 @@ from holotorch.scene.volume import Volume
 
 _CATALOGUE = {"teapot": "boston_teapot"}  # names of the thesis that differ from those of the catalogue
 _COUNTED = 1_000_000  # voxels of the histogram at most
+HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the tolerance of a run
+_SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
 
 
@@ -95,15 +100,44 @@ class VolumeExperiment:
     @cached_property
     def plans(self) -> list[HologramPlan]:
         """The plan of each colour's hologram."""
-        settings = self.settings
-        options = {"stride": self.stride, "tolerance": settings.tolerance, "cone": settings.hologram.cone}
         try:
-            return [
-                plan_hologram(self.grid, wavelength, self.depths, self.rays.shape, **options)
-                for wavelength in settings.wavelengths
-            ]
+            plans = [self._plan(wavelength) for wavelength in self.settings.wavelengths]
         except ValueError as error:
             raise ConfigError([f"hologram: {error}"]) from error
+        self._budget.predict(HOLOGRAM, max(plan.predicted_error for plan in plans))
+        return plans
+
+    def _plan(self, wavelength: float) -> HologramPlan:
+        scene = self.grid, wavelength, self.depths, self.rays.shape
+        options = {
+            "stride": self.stride,
+            "tolerance": self._budget.share(HOLOGRAM),
+            "cone": self.settings.hologram.cone,
+        }
+        return plan_hologram(*scene, **options, dtype=self.dtype)
+
+    @cached_property
+    def _budget(self) -> Budget:
+        given = self.settings.hologram.tolerance
+        parts = [ErringPart(HOLOGRAM, 1e-3, "hologram.tolerance", given), ErringPart(REFOCUSING, 3e-3)]
+        return Budget(self.settings.tolerance, parts)
+
+    @cached_property
+    def budget(self) -> Budget:
+        """Tolerances and predicted errors of hologram and refocusing; the latter at the ends of the scene."""
+        _ = self.plans
+        tolerance, ends = self._budget.share(REFOCUSING), {-min(self.depths), -max(self.depths)}
+        options = {"tolerance": tolerance, "dtype": self.dtype}
+        plans = [plan_propagation(self.grid, self.settings.wavelengths, end, **options) for end in ends]
+        self._budget.predict(REFOCUSING, max(plan.predicted_error for plan in plans))
+        return self._budget
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the fields: complex128 if a tolerance is closer to the rounding of complex64 than 10 times."""
+        asked = self.settings.tolerance, self.settings.hologram.tolerance
+        least = min((each for each in asked if each is not None), default=1.0)
+        return torch.complex128 if least < _SINGLE else torch.complex64
 
     @cached_property
     def transfer(self) -> TransferFunction:
@@ -179,13 +213,17 @@ class VolumeExperiment:
                 rendering_seconds += time.perf_counter() - started
                 for colour, total in enumerate(sums):
                     if part is None or part.takes(colour, j):
-                        total.add(j, plane[colour])
+                        total.add(j, self.precise(plane[colour]))
                 advance()
                 started = time.perf_counter()
         fields = []
         while sums:  # one by one, so that the memory of each spectrum is freed before the next is transformed
             fields.append(sums.pop(0).finish().to(self.device))
         return torch.stack(fields), rendering_seconds
+
+    def precise(self, plane: Tensor) -> Tensor:
+        """A plane of sources, in complex128 if that is the precision of the fields."""
+        return plane.to(self.dtype) if self.dtype == torch.complex128 else plane
 
     @property
     def refocus(self) -> list[float]:

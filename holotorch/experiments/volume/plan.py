@@ -6,14 +6,18 @@ from typing import Any
 import torch
 
 from holotorch.core.grid import Grid
+from holotorch.experiments.planning.machine import Machine, machine_speed, seconds_in_words
 from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.optics import diffraction_angle
 from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.scene import DVRSampler
 
-# Times were measured on two CPU cores.
-_FLOP_SECONDS = 4.2e-11  # seconds per operation of a HologramPlan
-_RAY_SECONDS = 1.5e-8  # seconds of rendering per ray and plane
+# Times on one core of the reference machine of ``planning.machine``.
+FLOP_SECONDS = 5.7e-11  # seconds per operation of a HologramPlan
+_RAY_SECONDS = 2.5e-8  # seconds of rendering per ray and plane
+_FIELD_SECONDS = 1e-8  # seconds / (n log2 n) to refocus a field of n samples
+_CALL_SECONDS = 0.015  # seconds to plan that
+_PICTURE_SECONDS = 2.4e-6  # seconds to score a pixel of a picture, encode it and draw it in a figure
 _BASE_BYTES = 500e6  # memory of the libraries
 _RAY_BYTES = 120  # memory of the renderer per ray
 _COARSE_SLABS = 0.1  # predicted error of a rendering that is noted
@@ -25,10 +29,11 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
     """Choices with their reasons, cost and physics, as plain JSON values."""
     settings, plans, depths = experiment.settings, experiment.plans, experiment.depths
     rays = math.prod(experiment.rays.shape)
-    flops = sum(each.flops for each in plans)
-    seconds = settings.report.seeds * (_FLOP_SECONDS * flops + _RAY_SECONDS * rays * len(depths))
+    machine = machine_speed(experiment.device)
+    seconds = {"holograms": settings.report.seeds * hologram_seconds(experiment, machine)}
+    seconds |= _evaluation_seconds(experiment, machine)
     slab_error = experiment.sampler().slab_error(experiment.volume)
-    spectra = [8 * math.prod(each.size) for each in plans]  # bytes
+    spectra = [experiment.dtype.itemsize * math.prod(each.size) for each in plans]  # bytes
     # While planes are added, each colour holds a sum and a summand; at the end, one spectrum is transformed as well.
     slab = 8 * rays * _SLAB * len(plans)
     peak = _BASE_BYTES + 2 * sum(spectra) + 1.5 * max(spectra) + slab + _RAY_BYTES * rays
@@ -58,11 +63,38 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
             }
             for wavelength, each in zip(settings.wavelengths, plans, strict=True)
         ],
-        "predicted_seconds": round(seconds, 2),
+        **experiment.budget.values(),
+        "precision": str(experiment.dtype).removeprefix("torch."),
+        "predicted_seconds": round(sum(seconds.values()), 2),
+        "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
         "predicted_peak_bytes": round(peak),
         "device": str(experiment.device),
         "physics": _physics(experiment),
         "notes": _notes(experiment, slab_error),
+    }
+
+
+def hologram_seconds(experiment: VolumeExperiment, machine: Machine) -> float:
+    """Seconds to render and compute the holograms of one realisation."""
+    seconds = rendering_seconds(experiment, machine)
+    return seconds + sum(FLOP_SECONDS * each.flops * machine.fft(math.prod(each.size)) for each in experiment.plans)
+
+
+def rendering_seconds(experiment: VolumeExperiment, machine: Machine) -> float:
+    """Seconds to render the volume once."""
+    return _RAY_SECONDS * math.prod(experiment.rays.shape) * len(experiment.depths) * machine.elementwise
+
+
+def _evaluation_seconds(experiment: VolumeExperiment, machine: Machine) -> dict[str, float]:
+    """Seconds for what follows the holograms, by its name."""
+    depths, pixels = len(experiment.refocus) or 3, math.prod(experiment.grid.shape)
+    field = _FIELD_SECONDS * pixels * math.log2(pixels) * machine.fft(pixels) + _CALL_SECONDS * machine.interpreter
+    pictures = _PICTURE_SECONDS * math.prod(experiment.rays.shape) * (depths + 2) * machine.interpreter
+    return {
+        "refocusing": experiment.settings.report.seeds * depths * len(experiment.plans) * field,
+        # The volume is rendered and its depth mapped once more for the comparison.
+        "pictures": pictures + 2 * rendering_seconds(experiment, machine),
+        "start-up and figures": machine.around(figures=2),
     }
 
 
@@ -89,11 +121,13 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         method = each["method"] + (f", {each['cone']} cone of light" if each["near"] else "")
         error = f"predicted error {each['predicted_error']:.1e}"
         lines.append(f"{each['wavelength_nm']:.0f} nm     method: {method} ({error}); {each['runner_up']}")
-    lines.append(
-        f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {settings.report.seeds} "
-        "realisation(s) of the random phases, without start-up, refocusing and figures; "
-        f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak"
-    )
+    lines += [
+        experiment.budget.text,
+        f"Precision  {values['precision']}",
+        f"Cost       about {values['predicted_seconds']:.2g} s for {settings.report.seeds} realisation(s) of the "
+        f"random phases ({seconds_in_words(values['seconds_of'])}); "
+        f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
+    ]
     lines += [f"Note       {note}" for note in values["notes"]]
     return "\n".join(lines)
 

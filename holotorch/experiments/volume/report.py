@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from holotorch.experiments.planning.errors import error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -28,6 +29,8 @@ def volume_section(record: RunRecord) -> list[str]:
     if source := record.picture("depth"):
         parts.append(figure(source, "Mean depth along each ray", "wide"))
     parts += [_scores(summary, depths), element("p", _cost(summary))]
+    if words := error_sentence(summary):
+        parts.append(element("p", words))
     rows = [[name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "holograms")]
     rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
     parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]

@@ -4,11 +4,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.planning.errors import error_values
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
@@ -16,11 +18,12 @@ from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.pictures import save_picture
 from holotorch.experiments.runs.processes import process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
-from holotorch.experiments.runs.signals import deferred
+from holotorch.experiments.runs.signals import Pressed, deferred
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import VolumeEvaluation
 from holotorch.experiments.volume.experiment import Part, VolumeExperiment
+from holotorch.experiments.volume.measured import hologram_error, refocusing_error
 from holotorch.io.files import save_array, write_bytes, write_json
 
 
@@ -60,8 +63,9 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
             return not pressed
         if not state.evaluation.count:
             raise KeyboardInterrupt
+        errors = _errors(experiment, state, pressed)
         with deferred(pressed):
-            return _write(opened, experiment, state)
+            return _write(opened, experiment, state, errors)
 
 
 def fingerprint_inputs(experiment: VolumeExperiment) -> tuple[VolumeSettings, dict[str, tuple[Any, ...]], set[str]]:
@@ -94,7 +98,7 @@ class _State:
         """Evaluate a realisation and save its results."""
         started = time.perf_counter()
         if seed == 0:
-            save_array(self.out / "arrays" / "hologram.npy", hologram.cpu())
+            save_array(self.out / "arrays" / "hologram.npy", hologram.to(torch.complex64).cpu())
         self.evaluation.add(hologram)
         refocusing = time.perf_counter() - started
         numbers = self.evaluation.numbers()
@@ -111,7 +115,21 @@ class _State:
         self.checkpoint.save({"sums": self.evaluation.sums, "count": self.evaluation.count, "rows": self.rows})
 
 
-def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State) -> bool:
+def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> dict[str, Any]:
+    """Predicted and measured errors of a complete run, for the summary; none after an interruption."""
+    if pressed or state.evaluation.count < experiment.settings.report.seeds:
+        return {}
+    hologram = torch.from_numpy(np.load(state.out / "arrays" / "hologram.npy")).to(experiment.device)
+    depths = state.evaluation.depths
+    try:
+        return error_values(
+            [hologram_error(experiment), refocusing_error(experiment, hologram, depths[len(depths) // 2])]
+        )
+    except KeyboardInterrupt:  # all else is computed, so that the run is complete without it
+        return {}
+
+
+def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, errors: dict[str, Any]) -> bool:
     out, files, evaluation = opened.path, Results(), state.evaluation
     files.write(write_table, out / "metrics.csv", state.rows)
     pictures = evaluation.pictures
@@ -138,6 +156,7 @@ def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State) -> bo
         "synthetic": experiment.synthetic,
         "refocused_m": evaluation.depths,
         **evaluation.numbers(),
+        **errors,
         **{name: round(sum(row[name] for row in state.rows), 3) for name in seconds},
         "peak_memory_bytes": peak_memory(),
     }

@@ -16,7 +16,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
 from holotorch.experiments.eye import experiment as eye_module
 from holotorch.experiments.eye import plan as eye_plan
-from holotorch.experiments.eye.config import ObserverSettings
+from holotorch.experiments.eye import run as eye_run
 from holotorch.experiments.eye.experiment import observer
 from holotorch.experiments.eye.plan import plan_text, plan_values
 from holotorch.experiments.eye.run import scene_settings
@@ -30,7 +30,7 @@ SCENE = (
     "'hologram={shape: [128, 128], pitch: 3.74 um, distance: 12 mm, depths: 12, rays: 64}']}"
 )
 # 128 px see so little of the pupil that the collapse is off by more than the default allows, by a rule of thumb.
-SMALL = [SCENE, "seeds=1", "light={sources: [laser, led]}", "focus=[12 mm]", "tolerance=0.1"]
+SMALL = [SCENE, "seeds=1", "light={sources: [laser, led]}", "focus=[12 mm]", "eye.tolerance=0.1"]
 # A display so small that both ways are quick: the collapse is predicted to be off by 4 %, the elements by 3 %. The
 # pupil takes no more than the pitch carries, a sine of 0.05 where that is 0.057 at the blue end.
 TINY = [
@@ -101,7 +101,7 @@ def test_few_wavelengths_are_as_good_as_many():
             wavelengths, weights = eye_module.PRESETS[source](wavelength).every(1e-9)
             return wavelengths, weights, len(wavelengths)
 
-    many = Dense(found.settings, found.scene, found.focus).image(hologram, "led", depth)
+    many = Dense(found.settings, found.scene, found.focus, found.budget).image(hologram, "led", depth)
     error = (few - many).square().mean().sqrt() / many.square().mean().sqrt()
     # 1 % expected for the integral; the sum over whole nanometres is itself that far from it.
     assert error < 0.03
@@ -127,7 +127,7 @@ def test_the_plan_says_how_the_scene_is_seen():
     values = plan_values(found)
     text = plan_text(found, values)
     assert "synthetic: a phantom was asked for" in text
-    assert "wavelengths simulated; the others are derived from them" in text and "without start-up and figures" in text
+    assert "wavelengths simulated; the others are derived from them" in text and "s start-up and figures" in text
     assert values["accommodation_mm"][0] == pytest.approx(120, rel=1e-6)  # the middle, where the display puts it
     assert main(["check", str(CONFIG), *SMALL]) == 0
 
@@ -138,7 +138,7 @@ def test_a_check_does_not_load_the_template_engine():
 
 
 def test_the_plan_names_what_it_does_not_count(capsys):
-    words = [*TINY, "tolerance=0.1", "tradeoff=[2 mm, 3 mm]", "sweep={steps: 5, realisations: 2}"]
+    words = [*TINY, "eye.tolerance=0.1", "tradeoff=[2 mm, 3 mm]", "sweep={steps: 5, realisations: 2}"]
     assert main(["check", str(CONFIG), *words]) == 0
     lines = capsys.readouterr().out.splitlines()[-2:]
     assert lines[0].startswith("Sweep      in addition, 5 depths of focus, 2 realisation(s) each")
@@ -154,10 +154,12 @@ def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, mo
         monkeypatch.setattr(
             spectral, way, lambda *words, name=name, **more: called.append(name) or collapse(*words, **more)
         )
-    given = load_config(CONFIG, [*TINY, f"tolerance={tolerance}"])
+    monkeypatch.setattr(eye_run, "observer_errors", lambda _: [])  # which propagates wavelengths of its own
+    given = load_config(CONFIG, [*TINY, f"eye.tolerance={tolerance}"])
     folder, _ = execute(given, tmp_path / "a", "a")
     planned = json.loads((folder / "plan.json").read_text())
-    assert [way["method"] for way in planned["retina"]] == [method] and planned["tolerance"] == tolerance
+    assert [way["method"] for way in planned["retina"]] == [method]
+    assert planned["tolerances"][2]["tolerance"] == tolerance
     assert set(called) == {method} and len(called) == planned["images"]
     assert f"Retina     {method} at" in (folder / "report.html").read_text()
 
@@ -165,7 +167,7 @@ def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, mo
 def test_what_observers_see_is_put_on_one_page(tmp_path, tiny):
     names = ("one", "two")
     for name, source in zip(names, ("laser", "led"), strict=True):
-        words = [*TINY, f"light={{sources: [{source}]}}", "tolerance=0.1"]
+        words = [*TINY, f"light={{sources: [{source}]}}", "eye.tolerance=0.1"]
         execute(load_config(CONFIG, words), tmp_path / name, name)
     assert main(["report", *(str(tmp_path / name) for name in names), "--out", str(tmp_path / "both.html")]) == 0
     page = (tmp_path / "both.html").read_text()
@@ -183,7 +185,7 @@ def test_what_observers_see_is_put_on_one_page(tmp_path, tiny):
 
 
 def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
-    given = [load_config(CONFIG, [*TINY, f"tolerance={tolerance}"]) for tolerance in (0.05, 0.03)]
+    given = [load_config(CONFIG, [*TINY, f"eye.tolerance={tolerance}"]) for tolerance in (0.05, 0.03)]
     short, long = (observer(each, scene_settings(each)) for each in given)
     hologram, _ = short.scene.hologram(0)
     seen = [found.image(hologram, None, 2e-3) for found in (short, long)]
@@ -191,14 +193,14 @@ def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
     ways = [found.retina(2e-3) for found in (short, long)]
     assert [way.method for way in ways] == ["collapse", "elements"]
     assert error < sum(way.predicted_error for way in ways)
-    predicted = [plan_values(found)["predicted_seconds"] for found in (short, long)]
+    predicted = [plan_values(found)["seconds_of"]["pictures"] for found in (short, long)]
     assert predicted[1] > 2 * predicted[0]
 
 
 def test_a_way_that_does_not_fit_is_refused_before_it_starts(capsys, monkeypatch):
-    assert main(["check", str(CONFIG), *TINY, "tolerance=0.05"]) == 0
+    assert main(["check", str(CONFIG), *TINY, "eye.tolerance=0.05"]) == 0
     monkeypatch.setattr(eye_plan, "_BASE_BYTES", 1e18)
-    assert main(["check", str(CONFIG), *TINY, "tolerance=0.05"]) == 2
+    assert main(["check", str(CONFIG), *TINY, "eye.tolerance=0.05"]) == 2
     assert "GB are free; use a smaller grid" in capsys.readouterr().err
     assert main(["check", str(CONFIG), *TINY]) == 2
     assert "use a smaller grid, or a larger tolerance" in capsys.readouterr().err
@@ -208,8 +210,8 @@ def test_the_teapot_of_the_thesis_is_collapsed():
     """Its configuration, its pixels; only the voxels are fewer."""
     change = "'volume={phantom: c60, samples: 16}', 'hologram={shape: [512, 512], pitch: 3.74 um, distance: 30 mm}'"
     given = load_config(CONFIG, [f"scene={{config: configs/volume/teapot.yaml, change: [{change}]}}"])
-    assert given.tolerance == ObserverSettings.model_fields["tolerance"].default == 0.03
     found = observer(given, scene_settings(given))
+    assert given.eye.tolerance is None and found.budget.share("retina") == 0.03
     ways = [found.retina(depth) for depth in found.focus]
     assert {way.method for way in ways} == {"collapse"} and all(way.predicted_error < 0.03 for way in ways)
 
@@ -256,7 +258,7 @@ def test_a_scene_that_the_display_cannot_show_is_refused():
 
 
 def _picture(source: str, *changes: str) -> torch.Tensor:
-    given = load_config(CONFIG, [*TINY, "tolerance=0.1", *changes])
+    given = load_config(CONFIG, [*TINY, "eye.tolerance=0.1", *changes])
     eye = observer(given, scene_settings(given))
     return eye.image(eye.scene.hologram()[0], source, 2e-3)
 
@@ -271,7 +273,7 @@ def test_an_eye_beside_the_axis_sees_the_same_plane_in_another_perspective():
     axis, side = _picture("laser"), _picture("laser", "eye.position=[0 m, 60 um]")
     assert side.isfinite().all() and 0.3 < side.sum() / axis.sum() < 3
     assert (axis - side).norm() > 0.05 * axis.norm()
-    given = load_config(CONFIG, [*TINY, "tolerance=0.1", "eye.position=[0 m, 1 mm]"])
+    given = load_config(CONFIG, [*TINY, "eye.tolerance=0.1", "eye.position=[0 m, 1 mm]"])
     with pytest.raises(ConfigError, match="eye.position: position of the eye must be within"):
         observer(given, scene_settings(given))  # before anything is computed
 
@@ -293,7 +295,7 @@ def test_a_lens_at_the_hologram_is_a_display_that_runs():
 
 
 def test_a_plan_says_that_an_eye_is_beside_the_axis():
-    given = load_config(CONFIG, [*TINY, "tolerance=0.1", "eye.position=[0 m, 60 um]"])
+    given = load_config(CONFIG, [*TINY, "eye.tolerance=0.1", "eye.position=[0 m, 60 um]"])
     eye = observer(given, scene_settings(given))
     text = plan_text(eye, plan_values(eye))
     assert "beside the axis, at y 0 mm, x 0.06 mm" in text and "derived" not in text

@@ -20,7 +20,7 @@ SCENE = (
 
 def looking(extent: float):
     light = f"light={{sources: [laser], extent: {extent}}}"
-    settings = load_config(CONFIG, [SCENE, "seeds=1", "focus=[12 mm]", "tolerance=0.1", light])
+    settings = load_config(CONFIG, [SCENE, "seeds=1", "focus=[12 mm]", "eye.tolerance=0.1", light])
     return observer(settings, scene_settings(settings))
 
 

@@ -24,7 +24,7 @@ QUICK = ["solver.max_steps=2", "report.baselines=[none]"]
             "eye/teapot",
             [
                 f"scene={{config: configs/volume/c60.yaml, change: {SCENE}}}",
-                *("seeds=1", "light={sources: [laser]}", "focus=[12 mm]", "tolerance=0.5"),
+                *("seeds=1", "light={sources: [laser]}", "focus=[12 mm]", "eye.tolerance=0.5"),
             ],
         ),
         ("perception/layout", ["items=[{icon: boat, azimuth_deg: 50}]"]),

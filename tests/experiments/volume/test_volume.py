@@ -152,7 +152,7 @@ def test_the_thesis_scenes_have_its_numbers(name):
     text = plan_text(small, plan_values(small))
     assert "synthetic: a phantom was asked for" in text and "GB of memory" in text
     assert "Scale      1 / 16 of the configuration: pixels, rays, distances" in text
-    assert "nm     method: " in text and "without start-up, refocusing and figures" in text
+    assert "nm     method: " in text and "s refocusing" in text and "s start-up and figures" in text
 
 
 def test_a_scene_that_cannot_be_had_is_said(monkeypatch):

@@ -1,0 +1,49 @@
+"""Predicted errors beside measured ones, for summary.json and the report."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+LIMIT = 30.0  # seconds on the reference machine that a reference may take, if the run takes as long
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The error of a part as the plan predicts it, and as it was measured against a more exact reference.
+
+    Attributes:
+        part: In words.
+        predicted: Relative L2 error.
+        measured: The same, or None if it was not measured.
+        note: What was compared with what, or why nothing was.
+    """
+
+    part: str
+    predicted: float
+    measured: float | None
+    note: str
+
+
+def not_measured(part: str, predicted: float, seconds: float) -> Comparison:
+    """A part whose reference is not affordable; ``seconds`` is its predicted time."""
+    return Comparison(part, predicted, None, f"not measured: reference would take {seconds:.2g} s")
+
+
+def error_values(comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """Entries of summary.json; the errors of the measured parts are added in squares."""
+    measured = [each for each in comparisons if each.measured is not None]
+    return {
+        "predicted_error": math.hypot(*(each.predicted for each in measured or comparisons)),
+        "measured_error": math.hypot(*(each.measured or 0.0 for each in measured)) if measured else None,
+        "errors": [vars(each) for each in comparisons],
+    }
+
+
+def error_sentence(summary: dict[str, Any]) -> str:
+    """The line of a report about the errors in a summary; empty for a summary without any."""
+    parts = []
+    for each in summary.get("errors", ()):
+        measured = "" if each["measured"] is None else f"{each['measured']:.1e} measured: "
+        parts.append(f"{each['part']} {each['predicted']:.1e} predicted, {measured}{each['note']}")
+    return f"Relative L2 error. {'; '.join(parts)}." if parts else ""

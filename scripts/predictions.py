@@ -1,0 +1,61 @@
+"""Predicted seconds of shipped configurations beside the measured ones: python scripts/predictions.py [--out FILE]."""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+# Name, words of ``holotorch run``, and whether start-up and figures are part of the prediction.
+RUNS = {
+    "pec fourier": (["configs/pec/fourier.yaml", "report.baselines=[]"], False),
+    "pec capped": (["configs/pec/capped.yaml", "report.baselines=[]"], False),
+    "pec fresnel": (["configs/pec/fresnel.yaml", "report.baselines=[]"], False),
+    "volume c60": (["configs/volume/c60.yaml", "scale=4"], True),
+    "volume c60, finer": (["configs/volume/c60.yaml", "scale=2"], True),
+    "volume engine": (["configs/volume/engine.yaml", "volume={phantom: shells}", "scale=4"], True),
+    "eye, laser": (
+        [
+            "configs/eye/teapot.yaml",
+            "scene={config: configs/volume/c60.yaml, change: ['hologram={shape: [256, 256], pitch: 3.74 um, "
+            "distance: 30 mm, depths: 29, rays: 128}']}",
+            "light={sources: [laser]}",
+            "seeds=1",
+        ],
+        True,
+    ),
+    "joint c60": (["configs/joint/teapot.yaml", "volume={phantom: c60}", "report.baselines=[]", "steps=20"], False),
+}
+
+
+def main() -> None:
+    """Run each configuration in a process of its own and print a line for it, then the median ratio."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, help="file to write the lines to as well")
+    lines, ratios = ["run: predicted s, measured s, measured / predicted"], []
+    options = parser.parse_args()
+    for name, (words, whole) in RUNS.items():
+        with tempfile.TemporaryDirectory() as folder:
+            out, started = Path(folder) / "run", time.perf_counter()
+            command = [sys.executable, "-m", "holotorch", "run", *words, "--out", str(out)]
+            subprocess.run(command, check=True, capture_output=True)
+            wall = time.perf_counter() - started
+            predicted = json.loads((out / "plan.json").read_text())["predicted_seconds"]
+            summary = json.loads((out / "summary.json").read_text())
+            methods = summary.get("methods", {}).get("corrected", {})
+            measured = wall if whole else methods.get("seconds", summary.get("seconds", wall))
+        ratios.append(measured / max(predicted, 1e-3))
+        lines.append(f"{name}: {predicted:.3g}, {measured:.3g}, {ratios[-1]:.2f}")
+        print(lines[-1], flush=True)
+    off = statistics.median(max(ratio, 1 / ratio) for ratio in ratios)
+    lines.append(f"median of the factor between them: {off:.2f} over {len(ratios)} runs")
+    print(lines[-1])
+    if options.out:
+        options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
