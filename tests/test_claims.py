@@ -1,4 +1,4 @@
-"""Every figure of the README has a claim, and every claim is borne out by the file of its last run."""
+"""Every figure of the README has a claim; claims and tables of guides are borne out by the files of the last runs."""
 
 import importlib.util
 import re
@@ -20,6 +20,7 @@ def load_claims():
 
 CLAIMS = load_claims()
 VERDICTS = CLAIMS.verdicts()
+CELLS = CLAIMS.cells()
 
 
 def rows() -> list[str]:
@@ -49,6 +50,28 @@ def test_lines_of_verdict_in_a_guide_are_those_of_the_last_run(path):
         for line in block.splitlines():
             clauses = re.split("[,;] ", line.strip())
             assert any(all(each in other for each in clauses) for other in known), f"in no verdict.txt: {line}"
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.guide}: {cell.row[2:34]}")
+def test_a_number_in_a_table_of_a_guide_is_that_of_the_last_run(cell):
+    assert cell.holds, cell
+
+
+def test_a_number_in_a_table_that_its_file_contradicts_is_caught(tmp_path):
+    (tmp_path / "guide.md").write_text("| a | 0.51 +- 0.2 | 3 |\n| b | 0.5 | 4 |\n")
+    (tmp_path / "run.csv").write_text("m,x,y\na,0.514,0.2\nb,0.56,1\nb,0.46,4\n")
+    (tmp_path / "tables.yaml").write_text(
+        """
+- guide: guide
+  row: "| a"
+  cells: [{file: run.csv, rows: {m: a}, columns: [x, y]}, {file: run.csv, rows: {m: a}, columns: [y]}]
+- {guide: guide, row: "| b", cells: [{file: run.csv, worst: true, rows: {m: b}, columns: [x]}]}
+"""
+    )
+    assert [cell.holds for cell in CLAIMS.cells(tmp_path, tmp_path)] == [True, False, True]
+    (tmp_path / "guide.md").write_text("| a | 0.51 +- 0.2 | 3 |\n")
+    with pytest.raises(ValueError, match="0 rows begin with '| b'"):
+        CLAIMS.cells(tmp_path, tmp_path)
 
 
 def test_a_claim_that_its_file_contradicts_is_caught(tmp_path):
