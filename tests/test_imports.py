@@ -28,7 +28,7 @@ ROOMS = {
         {"joint"},
         {"eye"},
         {"camera", "network", "pec", "volume", "perception", "propagation", "tracking"},
-        {"runs"},
+        {"runs", "web"},
         {"config"},
     ],
 }
