@@ -23,7 +23,7 @@ ROOMS = {
         {"camera"},
     ],
     "experiments": [
-        {"measure"},
+        {"measure", "view"},
         {"panel", "pec_study", "stability", "tracking_benchmark", "streaming"},
         {"joint"},
         {"eye"},
