@@ -16,6 +16,7 @@ from holotorch.experiments.streaming.commands import add_stream
 from holotorch.experiments.study_commands import add_study
 from holotorch.experiments.sweep.commands import add_sweep
 from holotorch.experiments.tracking.commands import add_tracking
+from holotorch.experiments.view.commands import add_view
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -257,6 +258,7 @@ def _parser() -> argparse.ArgumentParser:
     add_measure(commands)
     add_stream(commands)
     add_study(commands)
+    add_view(commands)
     command("doctor", _doctor, "check the installation and print what repairs it")
     return parser
 

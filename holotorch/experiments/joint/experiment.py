@@ -125,7 +125,7 @@ class JointExperiment:
     def halves(self) -> Views:
         """The left and the right half of the pupil at every corrected focus, which no method is given."""
         sides = ((0.0, 1.0), (0.0, -1.0))
-        return self._views([View(focus, self.radius, covered=side) for focus in self.foci for side in sides])
+        return self.views([View(focus, self.radius, covered=side) for focus in self.foci for side in sides])
 
     @cached_property
     def trained(self) -> Views:
@@ -138,17 +138,18 @@ class JointExperiment:
             r, a = (self.radius - radius) * math.sqrt(distance), 2 * math.pi * angle
             depth = self.foci[0] + focus * (self.foci[-1] - self.foci[0])
             views.append(View(depth, radius, (r * math.sin(a), r * math.cos(a))))
-        return self._views(views) if self.settings.eye.parallax else self.stack
+        return self.views(views) if self.settings.eye.parallax else self.stack
 
     def at_foci(self, foci: list[float]) -> Views:
         """The whole pupil at focal distances in metres."""
-        return self._views([View(focus, self.radius) for focus in foci])
+        return self.views([View(focus, self.radius) for focus in foci])
 
     def plane(self, index: int) -> Views:
         """The light of one plane alone, in focus."""
-        return self._views([View(self.depths[index], self.radius)], slice(index, index + 1))
+        return self.views([View(self.depths[index], self.radius)], slice(index, index + 1))
 
-    def _views(self, views: list[View], planes: slice = slice(None)) -> Views:
+    def views(self, views: list[View], planes: slice = slice(None)) -> Views:
+        """Any views, of the light of the chosen planes."""
         operator = PupilViews(self.grid, self.settings.wavelengths, views, longest=max(self.foci))
         return Views(operator.to(self.device), self._images(views, planes).to(self.device) / self._mean)
 

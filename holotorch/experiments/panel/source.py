@@ -77,12 +77,36 @@ def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
         raise ConfigError([f"{folder}: {error}"]) from error
 
 
-def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
-    experiment = build(settings)
+def pec_heaters(folder: Path, experiment: PECExperiment) -> Tensor:
+    """Heater phases of a run of kind ``pec``, float32 [F, all colours, H, W]. ValueError if they cannot be read."""
+    settings = experiment.settings
     shape = (settings.frames, len(settings.wavelengths), *settings.grid.shape)
-    heaters = _array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
+    heaters = run_array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
     checks.all_finite("phase", heaters)
     _check_axes(folder, experiment, heaters)
+    return heaters
+
+
+def joint_heaters(folder: Path, settings: JointSettings) -> Tensor:
+    """Heater phases of a run of kind ``joint``, float32 [F, C, H, W]. ValueError if they cannot be read."""
+    shape = (settings.frames, len(settings.wavelengths), *settings.display.shape)
+    heaters = run_array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
+    checks.all_finite("phase", heaters)
+    return heaters
+
+
+def volume_hologram(folder: Path, settings: VolumeSettings) -> Tensor:
+    """Field of a run of kind ``volume``, complex64 [3, H, W]. ValueError if it cannot be read."""
+    height, width = (size // settings.scale for size in settings.hologram.shape)
+    shape = (len(settings.wavelengths), height, width)
+    hologram = run_array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")
+    checks.all_finite("hologram", torch.view_as_real(hologram))
+    return hologram
+
+
+def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
+    experiment = build(settings)
+    heaters = pec_heaters(folder, experiment)
     phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
 
     def picture(fields: Tensor) -> Tensor:
@@ -94,9 +118,7 @@ def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
 
 def _from_joint(folder: Path, settings: JointSettings) -> PanelPhases:
     experiment = build_joint(settings)
-    shape = (settings.frames, len(settings.wavelengths), *settings.display.shape)
-    heaters = _array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
-    checks.all_finite("phase", heaters)
+    heaters = joint_heaters(folder, settings)
     middle = len(experiment.foci) // 2
 
     def picture(fields: Tensor) -> Tensor:
@@ -107,11 +129,8 @@ def _from_joint(folder: Path, settings: JointSettings) -> PanelPhases:
 
 
 def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> PanelPhases:
-    height, width = (size // settings.scale for size in settings.hologram.shape)
-    grid = Grid((height, width), settings.hologram.pitch)
-    shape = (len(settings.wavelengths), height, width)
-    hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")
-    checks.all_finite("hologram", torch.view_as_real(hologram))
+    hologram = volume_hologram(folder, settings)
+    grid = Grid((hologram.shape[-2], hologram.shape[-1]), settings.hologram.pitch)
     # The losses contain fourth powers of the field, which may overflow float32. The scale is a power of two, so exact.
     hologram = hologram * 2.0 ** -torch.frexp(hologram.abs().amax()).exponent.double().item()
     depth = _depth(folder, settings)
@@ -172,7 +191,7 @@ def _summary(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _array(path: Path, shape: tuple[int, ...], axes: str, dtype: str) -> Tensor:
+def run_array(path: Path, shape: tuple[int, ...], axes: str, dtype: str) -> Tensor:
     """An array of the run. ValueError if it is missing, damaged or of another shape or dtype."""
     if not path.is_file():
         raise ValueError(f"{path.name} is not in its arrays; finish the run first: holotorch resume")

@@ -34,9 +34,18 @@ class Result:
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
     """First metric of ``report.metrics`` for heater phases [F, C, H, W], mean over the lit colours."""
-    formed = experiment.picture_in(experiment.intensity(phase.double())).cpu()
+    return observed(experiment, phase.double())[1][f"{experiment.settings.report.metrics[0]}_mean"]
+
+
+def observed(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any]]:
+    """Picture [all colours, h, w] that heater phases [F, C, H, W] form, with the values of the target, and its scores.
+
+    The phases are propagated in their precision. The scores are those of ``report.metrics`` and the efficiency.
+    """
+    formed = experiment.picture_in(experiment.intensity(phase)).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
-    return _scores(experiment, picture, experiment.image)[f"{experiment.settings.report.metrics[0]}_mean"]
+    scores = _scores(experiment, picture, experiment.image)
+    return picture, scores | {"efficiency": _efficiency(experiment, formed)}
 
 
 def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:

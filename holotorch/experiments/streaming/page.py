@@ -11,8 +11,6 @@ the page should be served by TLS, which headsets need for WebXR.
 """
 
 import asyncio
-import hmac
-import ipaddress
 import itertools
 import json
 import math
@@ -24,7 +22,6 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
 from torch import Tensor
@@ -33,6 +30,8 @@ from holotorch.core import checks
 from holotorch.experiments.streaming.aligning import Aligner
 from holotorch.experiments.streaming.pictures import Channel, Encoder, PanelSource
 from holotorch.experiments.streaming.registered import RegisteredVolume
+from holotorch.experiments.web.guard import Guard, headers, is_loopback
+from holotorch.experiments.web.site import file_routes, listening
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.overlay import Undistorter, overlay
@@ -41,20 +40,12 @@ from holotorch.tracking.streaming.packet import FRAME, now
 
 PORT = 8765
 _FOLDER = Path(__file__).with_name("browser")
-_TYPES = {".html": "text/html", ".js": "text/javascript"}
-# The files of the page by the path of their address; no other file is ever read.
-_FILES = {"" if file.suffix == ".html" else file.name: file for file in sorted(_FOLDER.iterdir())}
 _LONGEST = 4096  # bytes of a message from a page
 _REPLIES = 16  # answers that wait for a page
 _PATIENCE = 5.0  # seconds that a page may take to accept a message
-_LOCAL = ("localhost", "127.0.0.1", "::1")
-_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; "
-    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
-    "Cache-Control": "no-store",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-}
+_HEADERS = headers(
+    "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; connect-src 'self'; base-uri 'none'"
+)
 
 
 class PageServer:
@@ -91,7 +82,7 @@ class PageServer:
         panel: PanelSource | Literal["overlay"] | None = None,
     ):
         self.port, self.host, self.certificate = checks.port(port), host, certificate
-        self.token = "" if _is_loopback(host) else secrets.token_urlsafe(16)
+        self.token = "" if is_loopback(host) else secrets.token_urlsafe(16)
         self.malformed = 0
         self.aligner, self._volume, self._panel = aligner, volume, panel
         self._catheter, self._camera, self._frame = catheter, camera, frame if aligner is None else aligner.name
@@ -119,18 +110,11 @@ class PageServer:
         if self.certificate is not None:
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.load_cert_chain(*self.certificate)
-        app = web.Application(middlewares=[self._guard])
-        files = [web.get(f"/{name}", self._file) for name in _FILES]
+        guard = Guard(local=not self.token, token=self.token)
+        app = web.Application(middlewares=[guard.middleware])
+        files = file_routes(_FOLDER, _HEADERS)
         app.add_routes([*files, web.get("/poses", self._poses), web.get("/volume", self._samples)])
-        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
-        await self._runner.setup()
-        site = web.TCPSite(self._runner, self.host, self.port, ssl_context=context, reuse_address=True)
-        try:
-            await site.start()
-        except OSError as error:
-            await self._runner.cleanup()
-            raise OSError(error.errno, f"port {self.port} for the page cannot be used: {error.strerror}") from None
-        self.port = self._runner.addresses[0][1]
+        self._runner, self.port = await listening(app, self.host, self.port, context)
         self._loop = asyncio.get_running_loop()
         if isinstance(self._panel, PanelSource):
             self._panel.start(partial(self.picture, Channel.PANEL))
@@ -202,29 +186,6 @@ class PageServer:
         message |= {"align": self.aligner is not None, "panel": self._panel is not None}
         message["volume"] = None if self._volume is None else self._volume.setup()
         return json.dumps(message, allow_nan=False)
-
-    @web.middleware
-    async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
-        """Refuse requests for other hosts, WebSockets of other sites, and requests without the token."""
-        name = urlsplit(f"//{request.host}").hostname or ""
-        if not self.token and name not in _LOCAL:
-            raise web.HTTPForbidden(text="this server answers to localhost only")
-        origin = request.headers.get("Origin")
-        if origin is not None and origin != f"{request.scheme}://{request.host}":
-            raise web.HTTPForbidden(text="this page is not for other sites")
-        public = request.path.endswith(".js")  # our own scripts, which browsers fetch without the token of the page
-        if (
-            self.token
-            and not public
-            and not hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode())
-        ):
-            raise web.HTTPForbidden(text="the address lacks its token; copy it whole from the terminal")
-        return await handler(request)
-
-    async def _file(self, request: web.Request) -> web.Response:
-        file = _FILES[request.path.removeprefix("/")]
-        kind = _TYPES[file.suffix]
-        return web.Response(body=file.read_bytes(), content_type=kind, charset="utf-8", headers=_HEADERS)
 
     async def _samples(self, request: web.Request) -> web.Response:
         if self._volume is None:
@@ -322,9 +283,3 @@ def _lens(camera: Camera | None) -> dict[str, float] | None:
         return None
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.size[1], "height": camera.size[0]}
-
-
-def _is_loopback(host: str) -> bool:
-    with suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"

@@ -15,7 +15,6 @@ participant looks at the fixation point.
 """
 
 import asyncio
-import hmac
 import json
 import logging
 import socket
@@ -31,17 +30,14 @@ from aiohttp import web
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.study.records import FixationRequest, SessionRequest, parse_record
 from holotorch.experiments.perception.study.session import StudySession
+from holotorch.experiments.web.guard import check_host, check_origin, check_token, headers
 
 _LARGEST = 10_000  # largest body of a request in bytes; a result has about 200
 _CONNECTIONS = 64  # largest number of simultaneous connections; a browser opens six
 _SECONDS = 10.0  # longest duration of a connection; an answer takes milliseconds, one about the fixation a second
 _LATEST_S = 0.3  # how long the check of a trial waits for gaze samples that are still on their way
 _STEP_S = 0.01  # how often a waiting request looks again
-_HEADERS = {
-    "Cache-Control": "no-store",
-    "X-Content-Type-Options": "nosniff",
-    "Content-Security-Policy": "frame-ancestors 'none'",
-}
+_HEADERS = headers("")
 # aiohttp would log every malformed request with a traceback; StudyServer prints the errors of its own code.
 _QUIET = logging.getLogger(f"{__name__}.requests")
 _QUIET.disabled = True
@@ -128,7 +124,8 @@ class StudyServer:
 
     async def _answer(self, request: web.BaseRequest) -> web.Response:
         """Answer with the page, the session of a window, or the status of a result."""
-        self._check_host(request)
+        # A foreign host name may resolve to this machine (DNS rebinding).
+        check_host(request, f"open {self.address}")
         if request.method == "GET" and request.path == "/":
             return web.Response(text=self._page, content_type="text/html")
         self._check_sender(request)
@@ -174,21 +171,14 @@ class StudyServer:
         while moment is not None and self.session.gaze and self.session.gaze.last < moment and time.monotonic() < end:
             await asyncio.sleep(_STEP_S)
 
-    def _check_host(self, request: web.BaseRequest) -> None:
-        """Refuse requests whose host name is foreign but resolves to this machine (DNS rebinding)."""
-        name = request.headers.get("Host", "").partition(":")[0]  # browsers omit port 80
-        if name not in ("127.0.0.1", "localhost"):
-            raise web.HTTPForbidden(text=f"open {self.address}")
-
     def _check_sender(self, request: web.BaseRequest) -> None:
         """Refuse requests from other pages, which the headers of the browser identify, and those without the token."""
-        origin = request.headers.get("Origin")
-        site = request.headers.get("Sec-Fetch-Site", "same-origin")
-        if site != "same-origin" or origin not in (None, f"http://{request.headers.get('Host', '')}"):
-            raise web.HTTPForbidden(text=f"another page asks; open {self.address}")
-        authorization = request.headers.get("Authorization", "").encode(errors="surrogateescape")
-        if not hmac.compare_digest(authorization, f"Bearer {self.token}".encode()):
-            raise web.HTTPForbidden(text="open the whole address that the recording program has printed, with its end")
+        another = f"another page asks; open {self.address}"
+        if request.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
+            raise web.HTTPForbidden(text=another)
+        check_origin(request, another)
+        refusal = "open the whole address that the recording program has printed, with its end"
+        check_token(request.headers.get("Authorization", ""), f"Bearer {self.token}", refusal)
 
 
 async def _read_json(request: web.BaseRequest) -> Any:

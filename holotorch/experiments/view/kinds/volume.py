@@ -1,0 +1,128 @@
+"""The view of the hologram of a volume: refocused, through a pupil, in another light, and turned."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from holotorch.core.grid import Grid
+from holotorch.correction.problem import best_scale
+from holotorch.experiments.panel.source import run_array, volume_hologram
+from holotorch.experiments.view.controls import Choice, Slider, span
+from holotorch.experiments.view.kinds.pupil import view_controls, view_of
+from holotorch.experiments.view.kinds.refocus import Refocuser
+from holotorch.experiments.view.kinds.turning import coarser, turned, turning_controls
+from holotorch.experiments.view.viewer import Picture, Shown, Viewer, percent
+from holotorch.experiments.volume.evaluation import pooled
+from holotorch.experiments.volume.experiment import VolumeExperiment
+from holotorch.metrics import SSIM_WINDOW, psnr, ssim
+
+_SHIFT = 20.0  # nm: largest shift of the wavelengths of the light
+_COARSE, _FINE = 128, 512  # pixels: largest side of the holograms of a turned volume
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A hologram and the rendering of its volume.
+
+    Attributes:
+        refocusers: Its colours, one by one.
+        rendering: Red, green and blue [3, h, w].
+        stride: Pixels of the hologram for each ray of the rendering.
+        scale: Factor by which all lengths are smaller than those of the run.
+    """
+
+    refocusers: list[Refocuser]
+    rendering: Tensor
+    stride: int
+    scale: int
+
+
+class VolumeViewer(Viewer):
+    """Pictures of the hologram of a run of kind ``volume``; see :class:`Viewer`."""
+
+    def __init__(self, folder: Path, experiment: VolumeExperiment):
+        self.title = "Hologram of a volume" + (" (synthetic)" if experiment.synthetic else "")
+        self._experiment = experiment
+        extent = torch.tensor(experiment.volume.extent, dtype=torch.float64)
+        half = experiment.width * float(extent.norm() / extent.max()) / 2  # of the volume in any direction
+        middle, ends = experiment.distance, (min(experiment.depths), max(experiment.depths))
+        self._foci = min(max(middle / 10, middle - half), ends[0]), max(middle + half, ends[1])
+        rendering = run_array(folder / "arrays" / "rendering.npy", (3, *experiment.rays.shape), "(C, h, w)", "float32")
+        self._stored = self._scene(volume_hologram(folder, experiment.settings), rendering, experiment, 1)
+        self.transforms = 3, *self._stored.refocusers[0].padded.shape
+        self._turned = lru_cache(2)(self._at_orientation)
+        self._proceed: Callable[[], None] = lambda: None
+        names = {f"{c}": f"{w * 1e9:.0f} nm only" for c, w in enumerate(experiment.settings.wavelengths)}
+        self.controls = [
+            *view_controls(experiment.grid, experiment.settings.wavelengths, self._foci, middle),
+            Choice("colour", "Colours", {"all": "all three"} | names, "all", "The lasers that are on."),
+            Slider(
+                "shift", "Wavelength off by", "nm", **span(-_SHIFT, _SHIFT, 0.0, 80),
+                explanation="The same hologram in light of another wavelength is in focus at another depth.",
+            ),
+            *turning_controls(experiment),
+        ]  # fmt: skip
+        self.note = (
+            "The stored hologram is propagated exactly. Each colour is scaled to fit the rendering best, and averaged "
+            "over the pixels of each ray. A turned volume has a new hologram of at most "
+            f"{_FINE} pixels a side, and one of {_COARSE} while it moves."
+        )
+
+    def show(self, values: Mapping[str, Any], coarse: bool, proceed: Callable[[], None]) -> Shown:
+        """See :class:`Viewer`."""
+        view = self._experiment.settings.view
+        reduced = False
+        if (values["azimuth"], values["elevation"]) == (view.azimuth_deg, view.elevation_deg):
+            scene = self._stored
+        else:
+            self._proceed = proceed
+            divisor = coarser(self._experiment.settings, _COARSE if coarse else _FINE)
+            reduced = coarse and divisor > coarser(self._experiment.settings, _FINE)
+            scene = self._turned(values["azimuth"], values["elevation"], divisor)
+        colours = range(3) if values["colour"] == "all" else [int(values["colour"])]
+        wavelengths, rendering = self._experiment.settings.wavelengths, scene.rendering[list(colours)]
+        seen = view_of(values, scene.scale)
+        images, shares = [], []
+        for c in colours:
+            light = [wavelengths[c] + 1e-9 * values["shift"]]
+            images.append(pooled(scene.refocusers[c].intensity(seen, light)[0], scene.stride).cpu())
+            shares += scene.refocusers[c].share()
+        formed = torch.stack(images)
+        picture = (formed * best_scale(formed, rendering)[:, None, None]).clamp(0, 1)
+        numbers = _scores(picture, rendering.clamp(0, 1)) | {
+            "light in the pupil": percent(sum(shares) / len(shares)),
+            "hologram": "{} x {} px".format(*scene.refocusers[0].grid.shape),
+        }
+        shown = Picture.of("shown", f"Hologram in focus at {values['focus']:.4g} mm", picture)
+        pictures = [shown, Picture.of("rendering", "Direct volume rendering", rendering)]
+        return Shown(pictures, numbers, reduced)
+
+    def _at_orientation(self, azimuth: float, elevation: float, divisor: int) -> Scene:
+        """The hologram and the rendering of the turned volume, with all lengths divided by ``divisor``."""
+        experiment = turned(self._experiment, azimuth, elevation, divisor)
+        with torch.no_grad():
+            rendering = experiment.sampler().render(experiment.volume)[0].cpu()
+        hologram, _ = experiment.hologram(advance=self._proceed)
+        return self._scene(hologram, rendering, experiment, divisor)
+
+    def _scene(self, hologram: Tensor, rendering: Tensor, experiment: VolumeExperiment, divisor: int) -> Scene:
+        longest = self._foci[1] / divisor
+        wavelengths, fields = experiment.settings.wavelengths, hologram.to(experiment.device)
+        grid = Grid(experiment.grid.shape, experiment.grid.pitch)
+        refocusers = [Refocuser(fields[None, c : c + 1], grid, [w], longest) for c, w in enumerate(wavelengths)]
+        return Scene(refocusers, rendering, experiment.stride, divisor)
+
+
+def _scores(picture: Tensor, wanted: Tensor) -> dict[str, str]:
+    """SSIM and PSNR of pictures [C, h, w] with values from 0 to 1, mean over the colours."""
+    numbers = {}
+    if min(wanted.shape[-2:]) >= SSIM_WINDOW:
+        numbers["SSIM to the rendering"] = f"{ssim(picture, wanted, data_range=1.0).mean().item():.3f}"
+    decibels = psnr(picture, wanted, data_range=1.0).mean().item()
+    return numbers | ({"PSNR": f"{decibels:.1f} dB"} if math.isfinite(decibels) else {})
