@@ -1,4 +1,4 @@
-"""Screenshots of the page of `holotorch stream --view`: python scripts/screenshots.py [HEAD.nrrd]; needs Chromium.
+"""Screenshots of the pages of `stream --view` and `view`: python scripts/screenshots.py [HEAD.nrrd]; needs Chromium.
 
 Frame and poses are synthetic. HEAD is a CT or MRI volume of a head (here that of the Visible Human, as published in the
 thesis's list of volumes); without one the slice shows the Marschner-Lobb signal.
@@ -15,11 +15,16 @@ from pathlib import Path
 import torch
 from PIL import Image
 
+from holotorch.experiments.execute import execute
+from holotorch.experiments.registry import load_config
 from holotorch.experiments.streaming.aligning import Aligner
 from holotorch.experiments.streaming.chromium import Tab, browser
 from holotorch.experiments.streaming.page import PageServer
 from holotorch.experiments.streaming.pictures import PanelSource
 from holotorch.experiments.streaming.registered import RegisteredVolume, register
+from holotorch.experiments.view.opening import open_viewer
+from holotorch.experiments.view.server import ViewServer
+from holotorch.io.bundled import find_config
 from holotorch.io.volumes import load_volume
 from holotorch.scene.phantoms import marschner_lobb
 from holotorch.scene.volume import Volume
@@ -86,17 +91,37 @@ async def taken(folder: Path, head: Path | None) -> list[bytes]:
     return pictures
 
 
+async def taken_of_run(folder: Path) -> bytes:
+    """The page of the demo's volume, refocused to its front half and turned."""
+    config = find_config("configs/demo_volume.yaml")
+    assert config is not None
+    run, _ = execute(load_config(config, ["report.seeds=1"]), folder / "run")
+    async with ViewServer(open_viewer(run)) as server, browser(folder, (1280, 820)) as open_tab:
+        tab = await open_tab(server.address)
+        await tab.until("view.state.drawn > 0")
+        await tab.value("view.set('azimuth', 40); view.set('focus', 8); view.set('radius', 2)")
+        await tab.until("view.state.drawn === view.state.asked && !view.state.coarse")
+        shot = await tab.call("Page.captureScreenshot")
+    return base64.b64decode(shot["data"])
+
+
+def small(picture: Image.Image, name: str) -> None:
+    """Write a picture of two thirds the size into the gallery."""
+    size = picture.width * 2 // 3, picture.height * 2 // 3
+    picture.resize(size, Image.Resampling.LANCZOS).save(ROOT / "scripts" / "gallery" / name)
+
+
 def main(head: Path | None) -> None:
-    """Write scripts/gallery/view.png."""
+    """Write view.png and view_run.png to scripts/gallery."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         shots = asyncio.run(taken(Path(folder), head))
     pictures = [Image.open(io.BytesIO(shot)).convert("RGB") for shot in shots]
     sheet = Image.new("RGB", (3 * SIZE[0] + 16, 2 * SIZE[1] + 8), "white")
     for i, picture in enumerate(pictures):
         sheet.paste(picture, (i % 3 * (SIZE[0] + 8), i // 3 * (SIZE[1] + 8)))
-    sheet.resize((sheet.width * 2 // 3, sheet.height * 2 // 3), Image.Resampling.LANCZOS).save(
-        ROOT / "scripts" / "gallery" / "view.png"
-    )
+    small(sheet, "view.png")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        small(Image.open(io.BytesIO(asyncio.run(taken_of_run(Path(folder))))).convert("RGB"), "view_run.png")
 
 
 if __name__ == "__main__":

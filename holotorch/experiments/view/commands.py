@@ -1,6 +1,7 @@
 """The command ``holotorch view``. Other modules are imported when it runs."""
 
 import argparse
+import os
 from pathlib import Path
 
 
@@ -19,9 +20,14 @@ def _view(options: argparse.Namespace) -> int:
 
     if not 0 <= options.port < 65536:
         raise ConfigError([f"--port: expected 0 (any that is free) to 65535, got {options.port}"])
+    import torch
+
     from holotorch.experiments.view.opening import open_viewer
 
     viewer = open_viewer(options.folder)
+    # Threads of one picture wait for each other, and the browser needs a core: if both of two cores are used, a picture
+    # of 60 ms takes up to 1.7 s.
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) - 1))
     if options.check:
         from holotorch.experiments.view.check import check
 

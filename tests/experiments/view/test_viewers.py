@@ -76,7 +76,7 @@ def test_a_corrected_picture_is_that_of_the_run_and_another_heat_spoils_it(runs)
     assert len(maps.pictures) == 3 and len(np.unique(by_name(maps)["630"].reshape(3, -1), axis=1).T) == 2
     warm = (rows @ phase[0] @ columns)[0] * 175 / np.pi
     caption = shown(viewer, picture="temperature", sigma=1.1).pictures[0].caption
-    assert caption == f"630 nm: dark {warm.min():.3g}, bright {warm.max():.3g} degC"
+    assert caption == f"630 nm: {warm.min():.1f} (dark) to {warm.max():.1f} degC (bright)"
 
 
 def test_a_hologram_is_refocused_as_by_propagation_and_turned(runs):
@@ -153,10 +153,11 @@ def test_an_observer_sees_what_the_run_has_stored(runs):
     first = shown(viewer)
     assert float(first.numbers["SSIM"]) == pytest.approx(np.mean(row["ssim"]), abs=6e-4)
     assert float(first.numbers["contrast of speckle"]) == pytest.approx(np.mean(row["contrast"]), abs=6e-4)
-    assert [each.name for each in first.pictures] == ["shown", "reference"]
+    assert [each.name for each in first.pictures] == ["shown", "beside"]
     assert shown(viewer, coarse=True).coarse and not shown(viewer, coarse=True, source="one").coarse
+    assert [each.name for each in shown(viewer, coarse=True, azimuth=40.0).pictures] == ["beside"]
     turned = shown(viewer, azimuth=40.0, source="one")
-    assert [each.name for each in turned.pictures] == ["shown", "rendering"] and "SSIM" not in turned.numbers
+    assert [each.caption for each in turned.pictures][1] == "Direct volume rendering" and "SSIM" not in turned.numbers
 
 
 @pytest.mark.parametrize("kind", VIEWERS)

@@ -17,7 +17,7 @@ from holotorch.experiments.view.controls import Choice, Slider, span
 from holotorch.experiments.view.viewer import Picture, Shown, Viewer, percent
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 
-_REMEMBERED = 4  # propagators of the last distances
+_REMEMBERED = 2  # propagators of the last distances, whose kernels may be large
 
 
 class PECViewer(Viewer):
@@ -117,6 +117,6 @@ class PECViewer(Viewer):
         for wavelength, each in zip(self._experiment.wavelengths, values[0].cpu(), strict=True):
             low, high = float(each.min()), float(each.max())
             coloured = torch.from_numpy(colormap(((each - low) / max(high - low, 1e-12)).numpy())[..., :3])
-            caption = f"{wavelength * 1e9:.0f} nm: dark {low:.3g}, bright {high:.3g} {unit}"
+            caption = f"{wavelength * 1e9:.0f} nm: {low:.1f} (dark) to {high:.1f} {unit} (bright)"
             pictures.append(Picture.of(f"{wavelength * 1e9:.0f}", caption, coloured.movedim(-1, 0)))
         return pictures
