@@ -22,6 +22,8 @@ def open_viewer(folder: Path) -> Viewer:
     try:
         record = RunRecord(folder)
         status = record.summary["status"]
+    except ConfigError:
+        raise
     except (ValueError, TypeError, LookupError, OSError) as error:
         raise ConfigError([f"{folder} holds a run that cannot be read: {type(error).__name__} {error}"]) from None
     if record.kind not in VIEWERS:
@@ -36,5 +38,7 @@ def open_viewer(folder: Path) -> Viewer:
     module, name = VIEWERS[record.kind]
     try:
         return getattr(import_module(module), name)(folder, find_kind(record.kind).build(settings))
+    except ConfigError:
+        raise
     except ValueError as error:
         raise ConfigError([f"{folder}: {error}"]) from None

@@ -8,7 +8,7 @@ const REST = 250;  // ms after the last movement until a fine picture is asked f
 const status = document.getElementById("status");
 const state = { asked: 0, drawn: 0, coarse: false, error: "", connected: false };
 window.view = { state, set, values };
-let timer = 0;
+let timer = 0, queue = Promise.resolve();  // pictures are drawn in the order in which they come
 
 function say(text, warn = false) {
   status.textContent = text;
@@ -24,6 +24,18 @@ function moved() {
   timer = setTimeout(() => { if (state.coarse || state.drawn < state.asked) ask(false); }, REST);
 }
 
+async function picture(header, files) {
+  if (header.number < state.drawn) return;
+  await draw(header, files, offerTurning);
+  Object.assign(state, { drawn: header.number, coarse: header.coarse, error: "" });
+  say(`${(1e3 * header.seconds).toFixed(0)} ms${header.coarse ? ", coarse while it moves" : ""}`);
+  // A coarse picture may come when nothing moves any more.
+  if (header.coarse && header.number === state.asked) {
+    clearTimeout(timer);
+    timer = setTimeout(() => ask(false), REST);
+  }
+}
+
 const link = connect({
   setup({ title, note, controls }) {
     document.title = `${title} - holotorch view`;
@@ -33,16 +45,8 @@ const link = connect({
     say("computing");
     ask(false);
   },
-  async picture(header, files) {
-    if (header.number < state.drawn) return;
-    await draw(header, files, offerTurning);
-    Object.assign(state, { drawn: header.number, coarse: header.coarse, error: "" });
-    say(`${(1e3 * header.seconds).toFixed(0)} ms${header.coarse ? ", coarse while it moves" : ""}`);
-    // A coarse picture may come when nothing moves any more.
-    if (header.coarse && header.number === state.asked) {
-       clearTimeout(timer);
-      timer = setTimeout(() => ask(false), REST);
-    }
+  picture(header, files) {
+    queue = queue.then(() => picture(header, files)).catch((error) => say(String(error), true));
   },
   refused({ number, text }) {
     if (number < state.drawn) return;

@@ -40,7 +40,9 @@ class PECViewer(Viewer):
         self.controls = self._controls()
         self.note = (
             "The heater phases are those of the run; only what is chosen here changes. The brightness of each colour "
-            "is that of the target" + (" at the best fit." if experiment.scale_free else ".")
+            "is that of the target"
+            + (" at the best fit." if experiment.scale_free else ".")
+            + (" Each distance shows a part of the target." if len(experiment.distances) > 1 else "")
         )
 
     def _controls(self) -> list[Slider | Choice]:
