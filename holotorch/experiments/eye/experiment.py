@@ -244,7 +244,7 @@ class Observer:
 
 def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Observer:
     """Build the scene and resolve the depths of focus. ConfigError if nothing is visible or the eye cannot focus."""
-    budget = _budget(settings, scene_settings)
+    budget = observer_budget(settings, scene_settings)
     # An eye sees the hologram itself: the tolerance of a scene, too, is that of its hologram alone.
     hologram = scene_settings.hologram.model_copy(update={"tolerance": budget.share(HOLOGRAM)})
     scene = build(scene_settings.model_copy(update={"hologram": hologram, "tolerance": None}))
@@ -271,7 +271,8 @@ def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Obse
     return result
 
 
-def _budget(settings: ObserverSettings, scene: VolumeSettings) -> Budget:
+def observer_budget(settings: ObserverSettings, scene: VolumeSettings) -> Budget:
+    """The tolerances of hologram, wavelengths and propagation to the retina."""
     given = scene.hologram.tolerance or scene.tolerance
     parts = [
         Part(HOLOGRAM, 1e-3, "the scene's tolerance", given),

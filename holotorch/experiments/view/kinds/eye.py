@@ -11,7 +11,7 @@ from torch import Tensor
 
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.quantities import PUPIL_RADIUS
-from holotorch.experiments.eye.experiment import LIT, PRESETS, RETINA, Observer
+from holotorch.experiments.eye.experiment import LIT, PRESETS, RETINA, Observer, observer_budget
 from holotorch.experiments.eye.tradeoff import WHITE
 from holotorch.experiments.panel.source import run_array
 from holotorch.experiments.view.controls import Choice, Slider, span
@@ -117,8 +117,9 @@ class EyeViewer(Viewer):
         settings = self._experiment.settings
         looser = max(self._experiment.budget.share(RETINA), _TOLERANCE)
         eye = settings.eye.model_copy(update={"pupil_radius": 1e-3 * radius, "tolerance": looser})
-        changed = {"eye": eye}
-        return replace(self._experiment, settings=settings.model_copy(update=changed))
+        settings = settings.model_copy(update={"eye": eye})
+        budget = observer_budget(settings, self._experiment.scene.settings)
+        return replace(self._experiment, settings=settings, budget=budget)
 
     def _srgb(self, light: Tensor) -> Tensor:
         return gamut_map(linear_srgb(light, self._matrix))
