@@ -125,6 +125,7 @@ def test_a_moving_volume_is_small_and_abandoned_only_at_rest(runs, monkeypatch):
     with pytest.raises(Outdated):
         viewer.show(checked(viewer.controls, {"azimuth": 25.0}), False, outdated)
     assert shown(viewer, azimuth=25.0).numbers["hologram"] == "32 x 32 px"
+    assert not shown(viewer, coarse=True, azimuth=25.0, focus=3.01).coarse  # the fine hologram is at hand
 
 
 def test_a_volume_on_a_chip_is_that_of_its_views(runs):

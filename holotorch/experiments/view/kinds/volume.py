@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +55,7 @@ class VolumeViewer(Viewer):
         rendering = run_array(folder / "arrays" / "rendering.npy", (3, *experiment.rays.shape), "(C, h, w)", "float32")
         self._stored = self._scene(volume_hologram(folder, experiment.settings), rendering, experiment, 1)
         self.transforms = 3, *self._stored.refocusers[0].padded.shape
-        self._turned = lru_cache(2)(self._at_orientation)
-        self._proceed: Callable[[], None] = lambda: None
+        self._turned: dict[int, tuple[tuple[float, float], Scene]] = {}  # the last orientation by the divisor
         names = {f"{c}": f"{w * 1e9:.0f} nm only" for c, w in enumerate(experiment.settings.wavelengths)}
         self.controls = [
             *view_controls(experiment.grid, experiment.settings.wavelengths, self._foci, middle),
@@ -76,15 +74,7 @@ class VolumeViewer(Viewer):
 
     def show(self, values: Mapping[str, Any], coarse: bool, proceed: Callable[[], None]) -> Shown:
         """See :class:`Viewer`."""
-        view = self._experiment.settings.view
-        reduced = False
-        if (values["azimuth"], values["elevation"]) == (view.azimuth_deg, view.elevation_deg):
-            scene = self._stored
-        else:
-            self._proceed = proceed
-            divisor = coarser(self._experiment.settings, _COARSE if coarse else _FINE)
-            reduced = coarse and divisor > coarser(self._experiment.settings, _FINE)
-            scene = self._turned(values["azimuth"], values["elevation"], divisor)
+        scene, reduced = self._scene_at((values["azimuth"], values["elevation"]), coarse, proceed)
         colours = range(3) if values["colour"] == "all" else [int(values["colour"])]
         wavelengths, rendering = self._experiment.settings.wavelengths, scene.rendering[list(colours)]
         seen = view_of(values, scene.scale)
@@ -103,13 +93,22 @@ class VolumeViewer(Viewer):
         pictures = [shown, Picture.of("rendering", "Direct volume rendering", rendering)]
         return Shown(pictures, numbers, reduced)
 
-    def _at_orientation(self, azimuth: float, elevation: float, divisor: int) -> Scene:
-        """The hologram and the rendering of the turned volume, with all lengths divided by ``divisor``."""
-        experiment = turned(self._experiment, azimuth, elevation, divisor)
-        with torch.no_grad():
-            rendering = experiment.sampler().render(experiment.volume)[0].cpu()
-        hologram, _ = experiment.hologram(advance=self._proceed)
-        return self._scene(hologram, rendering, experiment, divisor)
+    def _scene_at(self, angles: tuple[float, float], coarse: bool, proceed: Callable[[], None]) -> tuple[Scene, bool]:
+        """The scene at an orientation in degrees, and whether it is smaller than at rest."""
+        settings = self._experiment.settings
+        if angles == (settings.view.azimuth_deg, settings.view.elevation_deg):
+            return self._stored, False
+        divisor = fine = coarser(settings, _FINE)
+        if coarse and (fine not in self._turned or self._turned[fine][0] != angles):
+            divisor = coarser(settings, _COARSE)
+        if divisor not in self._turned or self._turned[divisor][0] != angles:
+            self._turned.pop(divisor, None)  # its memory is needed
+            experiment = turned(self._experiment, *angles, divisor)
+            with torch.no_grad():
+                rendering = experiment.sampler().render(experiment.volume)[0].cpu()
+            hologram, _ = experiment.hologram(advance=proceed)
+            self._turned[divisor] = angles, self._scene(hologram, rendering, experiment, divisor)
+        return self._turned[divisor][1], divisor > fine
 
     def _scene(self, hologram: Tensor, rendering: Tensor, experiment: VolumeExperiment, divisor: int) -> Scene:
         longest = self._foci[1] / divisor
