@@ -13,11 +13,14 @@ from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
 from holotorch.experiments.joint.experiment import build
-from holotorch.experiments.registry import load_config
+from holotorch.experiments.registry import find_kind, load_config
 from holotorch.experiments.view.check import check
 from holotorch.experiments.view.controls import Choice, Slider, checked, span
 from holotorch.experiments.view.opening import VIEWERS, open_viewer
 from holotorch.experiments.view.viewer import Outdated, Picture
+from holotorch.io.colour_tables import srgb_matrix, white_balance
+from holotorch.optics import equal_power, gamut_map, tone_map
+from holotorch.optics.picture import linear_srgb
 
 MORE = {
     "pec": ["frames=2", "multiplexing=independent"],
@@ -115,8 +118,15 @@ def test_a_moving_volume_is_small_and_abandoned_only_at_rest(runs, monkeypatch):
     monkeypatch.setattr(volume, "_COARSE", 16)
     monkeypatch.setattr("holotorch.experiments.view.kinds.turning._LEAST", 8)
     viewer = open_viewer(runs["volume"])
-    moving = shown(viewer, coarse=True, azimuth=20.0)
+    moving = shown(viewer, coarse=True, azimuth=20.0, focus=3.02)
     assert moving.coarse and moving.numbers["hologram"] == "16 x 16 px"
+    # It is the scene of the run's setting ``scale``, in focus at half the distance.
+    again = load_config(runs["volume"] / "config.yaml", ["view.azimuth_deg=20", "scale=2"])
+    folder = runs["volume"].parent / "small"
+    assert execute(again, folder)[1]
+    small = open_viewer(folder)
+    assert np.array_equal(by_name(moving)["shown"], by_name(shown(small, focus=1.51))["shown"])
+    assert not np.array_equal(by_name(moving)["shown"], by_name(shown(small, focus=1.5))["shown"])
     assert not shown(viewer, coarse=True).coarse  # the stored hologram needs no smaller one
 
     def outdated():
@@ -156,6 +166,19 @@ def test_an_observer_sees_what_the_run_has_stored(runs):
     assert float(first.numbers["contrast of speckle"]) == pytest.approx(np.mean(row["contrast"]), abs=6e-4)
     assert [each.name for each in first.pictures] == ["shown", "beside"]
     assert shown(viewer, coarse=True).coarse and not shown(viewer, coarse=True, source="one").coarse
+    # Another light and pupil, by the library's own call.
+    settings = load_config(folder / "config.yaml", ["eye.pupil_radius=0.12 mm", "light.sources=[led]"])
+    observer = find_kind("eye").build(settings)
+    hologram, _ = observer.scene.hologram(settings.seed)
+    with torch.no_grad():
+        rendering = observer.scene.sampler().render(observer.scene.volume)[0]
+        light = equal_power(observer.image(hologram, "led", 2e-3), rendering)
+    wavelengths = observer.scene.settings.wavelengths
+    colour = gamut_map(linear_srgb(light, srgb_matrix(wavelengths, white_balance(wavelengths)).float()))
+    wanted = tone_map(colour, peak=colour.flatten().quantile(0.995)).numpy()
+    led = by_name(shown(viewer, source="led", pupil=0.12))["shown"]
+    assert np.abs(led - wanted).max() < LEVEL
+    assert np.abs(by_name(shown(viewer, source="one", pupil=0.12))["shown"] - wanted).max() > 10 * LEVEL
     assert [each.name for each in shown(viewer, coarse=True, azimuth=40.0).pictures] == ["beside"]
     turned = shown(viewer, azimuth=40.0, source="one")
     assert [each.caption for each in turned.pictures][1] == "Direct volume rendering" and "SSIM" not in turned.numbers
