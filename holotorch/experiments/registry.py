@@ -7,6 +7,7 @@ from typing import Any
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import nearest, validated
 from holotorch.experiments.config.source import read_source
+from holotorch.experiments.config.version import upgraded
 from holotorch.experiments.kind import ExperimentKind
 
 # Name of a kind in YAML, and the package whose module ``kind`` defines that kind; the module is loaded on demand.
@@ -33,7 +34,7 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
 
     ConfigError with all mistakes, one line each with file, line and column.
     """
-    source = read_source(Path(path), overrides or [])
+    source = upgraded(read_source(Path(path), overrides or []))
     name = source.data.get("experiment")
     if not isinstance(name, str) or name not in KINDS:
         got = f"got {name!r}" + nearest(str(name), list(KINDS)) if "experiment" in source.data else "it is missing"

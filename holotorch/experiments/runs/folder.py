@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import validated
 from holotorch.experiments.config.source import read_source
+from holotorch.experiments.config.version import FIRST_LINE, upgraded
 from holotorch.experiments.runs.environment import environment
 from holotorch.experiments.runs.fingerprint import differences, fingerprint
 from holotorch.experiments.runs.plan import RunPlan
@@ -92,7 +93,8 @@ def open_run(
             (folder / "images").mkdir(exist_ok=True)
             write_json(folder / "env.json", environment(getattr(settings, "seed", 0), torch.device(device)))
             if new:
-                write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+                text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
+                write_text(folder / "config.yaml", FIRST_LINE + text)
             yield RunFolder(folder, name, plan, pressed, resumes)
 
 
@@ -111,7 +113,7 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
     if "summary.json" in files or not files >= {"env.json", "config.yaml"}:
         return False
     try:
-        previous = validated(read_source(folder / "config.yaml", []), type(settings))
+        previous = validated(upgraded(read_source(folder / "config.yaml", [])), type(settings))
     except ConfigError:
         return False
     if changed := differences(fingerprint(previous, {}), fingerprint(settings, {})):
