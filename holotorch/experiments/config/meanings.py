@@ -38,7 +38,7 @@ MEANINGS = {
     "StudySettings.study": "which table of comparison",
     "StudySettings.max_steps": "largest number of steps of each solver",
     # Volumes.
-    "VolumeSettings.tolerance": "largest relative error of the hologram, from which its method follows",
+    "VolumeSettings.tolerance": "largest relative error, divided between the hologram and its refocusing",
     "VolumeSource.path": "a CT or other volume: NRRD, MetaImage, raw, TIFF, VTK, NIfTI, DICOM, HDF5, Zarr, NumPy",
     "VolumeSource.scene": "a volume of the public catalogue, fetched once",
     "VolumeSource.phantom": "a synthetic volume",

@@ -1,6 +1,7 @@
 """Run of kind ``eye``: pictures of every source and focus, their measurements, and the files of the run folder."""
 
 import itertools
+import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -55,6 +56,18 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     return scene
 
 
+def _errors(eye: Observer) -> dict[str, Any]:
+    """Predicted and measured errors; none if memory is short, since all else is computed by then."""
+    try:
+        return error_values(observer_errors(eye))
+    except MemoryError:
+        return {}
+    except RuntimeError as error:  # torch's own way to say so
+        if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
+            raise
+        return {}
+
+
 def visible_surface(eye: Observer) -> eye_focus.Surface | None:
     """The surface that the focus is swept over, or None without a sweep. ConfigError for a scene without a surface."""
     try:
@@ -83,7 +96,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
             files.write(write_table, folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
             print("\n".join(in_words(cases)))
         done = True
-        errors = error_values(observer_errors(eye))
+        errors = _errors(eye)
     except KeyboardInterrupt:
         if not views.references:
             raise

@@ -1,5 +1,6 @@
 """A run of the volume experiment: it can be resumed after each realisation, and several processes can share it."""
 
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,11 @@ def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> di
         return error_values(
             [hologram_error(experiment), refocusing_error(experiment, hologram, depths[len(depths) // 2])]
         )
-    except KeyboardInterrupt:  # all else is computed, so that the run is complete without it
+    except (KeyboardInterrupt, MemoryError):  # all else is computed, so that the run is complete without it
+        return {}
+    except RuntimeError as error:  # torch's own way to say so
+        if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
+            raise
         return {}
 
 
