@@ -24,7 +24,7 @@ FORMATS = ("png", "bmp", "exr")
 # Entry "content" of export.json for a run of kind ``pec``.
 _AFTER_SPREADING = (
     "phase after the heat has spread, modulo 2 pi, for a liquid-crystal panel; for the heaters of a thermal chip use "
-    "arrays/phase.npy, [F, C, H, W] in rad before spreading and not modulo 2 pi"
+    "holotorch export-heaters, or arrays/phase.npy, [F, C, H, W] in rad before spreading and not modulo 2 pi"
 )
 
 

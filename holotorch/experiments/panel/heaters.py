@@ -2,7 +2,9 @@
 
 import csv
 import io
-import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from holotorch import __version__
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.experiment import build as build_joint
+from holotorch.experiments.panel.source import joint_heaters, pec_heaters
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.experiment import build
 from holotorch.experiments.registry import load_config
@@ -31,12 +34,30 @@ _MEANINGS = {
 }
 
 
+@dataclass(frozen=True)
+class _Chip:
+    """The heaters of a finished run, and the chip that the run assumed.
+
+    Attributes:
+        phase: Heater phases in rad, float64 [F, C, H, W].
+        array: The chip's response to heat.
+        spread: From heater phases to the phases of the light, with all that the run knows of the heat.
+        limit: Upper limit of the run on the phases of the light in rad; None without one.
+    """
+
+    phase: Tensor
+    array: PhasedArray
+    spread: Callable[[Tensor], Tensor]
+    limit: float | None
+
+
 def export_heaters(folder: Path, out: Path | None = None, *, bits: int = 16) -> tuple[Path, dict[str, Any]]:
     """Write the heater phases, temperatures and optical phases of a run of kind ``pec`` or ``joint``.
 
     For each frame and colour and each of the three, a NumPy file (float32 [H, W]), a CSV file (a line for each row of
     pixels) and a 16-bit PNG; ``export.json`` says which is which, its unit, and what a step of the PNG stands for. The
-    PNG of the heaters holds drive levels of ``bits`` bits, evenly spaced from 0 to the largest phase of the run.
+    PNG of the heaters holds drive levels of ``bits`` bits, evenly spaced from 0 to the largest phase of the run. Heat
+    that is left from earlier frames counts if the run counts it; the files then hold the end of each frame.
 
     Returns:
         The folder of the files (``out``, by default ``heaters`` in that of the run), and the content of export.json.
@@ -46,7 +67,7 @@ def export_heaters(folder: Path, out: Path | None = None, *, bits: int = 16) -> 
     """
     if not 1 <= bits <= 16:
         raise ConfigError([f"expected heaters of 1 to 16 bits, got {bits}"])
-    phase, array = _load(folder)
+    chip = _load(folder)
     place = folder / "heaters" if out is None else out
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -54,41 +75,64 @@ def export_heaters(folder: Path, out: Path | None = None, *, bits: int = 16) -> 
             raise ConfigError([f"{place} holds files already; choose another --out or delete it"])
     except OSError as error:
         raise ConfigError([f"cannot write to {place}: {error.strerror}"]) from None
-    optical = array.crosstalk(phase)
+    try:
+        report = _export(place, chip, bits) | {"source": str(folder), "holotorch": __version__}
+        write_json(place / "export.json", report)
+    except BaseException:
+        shutil.rmtree(place)  # the folder was empty before, so all files are of this export
+        raise
+    return place, report
+
+
+def _export(place: Path, chip: _Chip, bits: int) -> dict[str, Any]:
+    """Write all files but export.json, whose content it returns."""
+    phase, array = chip.phase, chip.array
+    optical = chip.spread(phase)
     maps = {"heater": phase, "temperature": array.temperature(optical), "optical": optical}
     steps = {name: values.max().item() / (2**16 - 1) for name, values in maps.items()}
     steps["heater"] = phase.max().item() / (2**bits - 1)
+    driven = chip.spread((phase / (steps["heater"] or 1.0)).round() * steps["heater"])
     files: list[dict[str, Any]] = []
     for name, values in maps.items():
         unit, meaning = _MEANINGS[name]
         for frame, colour in np.ndindex(*values.shape[:2]):
             wavelength = array.wavelengths[colour]
-            stem = f"{name}_frame{frame:02d}_{wavelength * 1e9:.0f}nm"
-            about = {"quantity": name, "unit": unit, "meaning": meaning, "frame": frame, "wavelength_m": wavelength}
+            # The index of the colour keeps files apart whose wavelengths are the same nanometres.
+            stem = f"{name}_frame{frame:02d}_colour{colour}_{wavelength * 1e9:.0f}nm"
+            about = {"quantity": name, "unit": unit, "meaning": meaning, "frame": frame, "colour": colour}
+            about["wavelength_m"] = wavelength
             _write(place / stem, values[frame, colour], steps[name] or 1.0, about)
             files.append({"files": [f"{stem}.npy", f"{stem}.csv", f"{stem}.png"], **about, "png_step": steps[name]})
-    report = {
-        "source": str(folder),
+    return {
         "frames": phase.shape[0],
         "wavelengths_m": list(array.wavelengths),
         "rad_per_K": list(array.response),
         "heater_bits": bits,
         "peak_temperature_K": maps["temperature"].max().item(),
+        "peak_temperature_of_levels_K": array.temperature(driven).max().item(),
+        "peak_phase_of_levels_rad": driven.max().item(),
+        "limit_rad": chip.limit,
         "files": files,
-        "holotorch": __version__,
     }
-    write_json(place / "export.json", report)
-    return place, report
 
 
 def heaters_text(report: dict[str, Any]) -> str:
     """The export in words."""
-    step = report["files"][0]["png_step"]
+    step, limit, peak = report["files"][0]["png_step"], report["limit_rad"], report["peak_phase_of_levels_rad"]
+    warning = ""
+    # Less than a degree at the thesis's limit of 700; 16 bits and float32 exceed a limit by far less.
+    if limit is not None and peak > limit * (1 + 1e-3):
+        warning = (
+            f"\nWARNING: rounded to {report['heater_bits']} bits, the heaters take the light to {peak:.4g} rad, "
+            f"{report['peak_temperature_of_levels_K']:.0f} K above ambient, and the limit of the run is {limit:.4g} "
+            "rad; use more bits, or compute the run for them (modulator.bits of kind pec)"
+        )
     return (
         f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s): heater_*: phases that the heaters "
         f"alone cause, in rad before the heat spreads (a step of the PNG is {step:.4g} rad, {report['heater_bits']} "
         f"bits); temperature_*: K above ambient, at most {report['peak_temperature_K']:.0f}; optical_*: phases of the "
         "light in rad after spreading, not modulo 2 pi. A liquid-crystal panel needs holotorch export-slm instead"
+        + warning
     )
 
 
@@ -101,26 +145,22 @@ def _write(stem: Path, values: Tensor, step: float, about: dict[str, Any]) -> No
     write_levels(stem.with_suffix(".png"), levels, about | {"step": step})
 
 
-def _load(folder: Path) -> tuple[Tensor, PhasedArray]:
-    """Heater phases [F, C, H, W], float64, and the array of a run."""
+def _load(folder: Path) -> _Chip:
+    """The heaters of a run; ConfigError for a folder that has none."""
     if not (folder / "config.yaml").is_file():
         raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
     settings = load_config(folder / "config.yaml")
-    if isinstance(settings, PECSettings):
-        experiment = build(settings)
-        array = experiment.array
-        lit = experiment.lit.tolist()
-    elif isinstance(settings, JointSettings):
-        joint = build_joint(settings)
-        array = PhasedArray(settings.wavelengths, joint.crosstalk.cpu())
-        lit = [True] * len(settings.wavelengths)
-    else:
-        raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and joint have heaters"])
-    path = folder / "arrays" / "phase.npy"
     try:
-        phase = torch.from_numpy(np.load(path, allow_pickle=False).astype(np.float64))
-    except (OSError, ValueError, EOFError) as error:
-        raise ConfigError([f"{path}: cannot read the heater phases: {error}"]) from None
-    if phase.ndim != 4 or phase.shape[1] != len(lit) or not math.isfinite(phase.sum().item()):
-        raise ConfigError([f"{path}: expected finite phases [F, {len(lit)}, H, W], got {tuple(phase.shape)}"])
-    return phase[:, torch.tensor(lit)], array
+        if isinstance(settings, PECSettings):
+            experiment = build(settings)
+            phase = pec_heaters(folder, experiment)[:, experiment.lit].double()
+            return _Chip(phase, experiment.array, experiment.array.crosstalk, experiment.limit)
+        if isinstance(settings, JointSettings):
+            joint = build_joint(settings)
+            array = PhasedArray(settings.wavelengths, joint.crosstalk.cpu())
+            return _Chip(joint_heaters(folder, settings).double(), array, joint.heat.cpu(), settings.display.max_phase)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError([f"{folder}: {error}"]) from error
+    raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and joint have heaters"])

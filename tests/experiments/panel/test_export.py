@@ -299,7 +299,7 @@ def test_command(pec, tmp_path, capsys):
     assert "0.0071 / 0.0071 / 0.0071 rad expected" in lines[2]
     # The files are of no use to a thermal chip, and the text says so.
     assert lines[-2].startswith("Content    phase after the heat has spread, modulo 2 pi, for a liquid-crystal panel")
-    assert "arrays/phase.npy" in lines[-2]
+    assert "holotorch export-heaters" in lines[-2] and "arrays/phase.npy" in lines[-2]
     assert json.loads((tmp_path / "a" / "export.json").read_text())["content"] == lines[-2].removeprefix("Content    ")
     assert main(words) == 2
     assert "holds files already; choose another --out" in capsys.readouterr().err

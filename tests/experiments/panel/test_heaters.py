@@ -7,9 +7,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from paths import CONFIGS
+from tiny_runs import RUNS
 
 from holotorch.cli import main
+from holotorch.experiments.execute import execute
+from holotorch.experiments.panel.heaters import export_heaters
 from holotorch.experiments.registry import load_config
+from holotorch.experiments.view.opening import open_viewer
 from holotorch.io.panel_files import read_levels
 
 SMALL = ["configs/pec/fourier.yaml", "grid.shape=[24,20]", "report.baselines=[]", "solver={kind: lbfgs, max_steps: 8}"]
@@ -104,3 +109,78 @@ def test_heater_files_say_what_they_are_and_agree(tmp_path, capsys):
         assert entry["quantity"] != "heater" or levels.int().max() <= 255
     assert main(["export-heaters", str(run)]) == 2 and "holds files already" in capsys.readouterr().err
     assert main(["export-heaters", str(tmp_path)]) == 2 and "holds no run" in capsys.readouterr().err
+
+
+def test_heat_that_is_left_from_earlier_frames_is_in_the_files(tiny, tmp_path):
+    config, *words = RUNS["joint"]
+    words += ["report.baselines=[]", "heat={frame_us: 20, time_constant_us: 10}", "display.sigma_px=0.66"]
+    run = tmp_path / "run"
+    assert execute(load_config(CONFIGS / config, words), run)[1]
+    _, report = export_heaters(run)
+    phase = np.load(run / "arrays" / "phase.npy").astype(float)
+    rows, columns = (np.exp(-(np.subtract.outer(range(n), range(n)) ** 2) / 0.66**2) for n in phase.shape[-2:])
+    warm, wanted = np.zeros(phase.shape[1:]), np.zeros_like(phase)
+    for _ in range(20):  # cycles from a cold chip; exp(-2) of the heat is left after each frame
+        for frame, steady in enumerate(rows @ phase @ columns):
+            warm = steady + (warm - steady) * math.exp(-2)
+            wanted[frame] = warm
+    # The heat that is left is far above the tolerance: the test can fail.
+    assert np.abs(wanted - rows @ phase @ columns).max() > 0.1
+    for entry in report["files"]:
+        if entry["quantity"] == "optical":
+            array = np.load(run / "heaters" / entry["files"][0])
+            np.testing.assert_allclose(array, wanted[entry["frame"], entry["colour"]], rtol=1e-5, atol=1e-4)
+    response = [math.pi / 175 * 630e-9 / wavelength for wavelength in report["wavelengths_m"]]
+    hottest = (wanted / np.array(response)[:, None, None]).max()
+    assert report["peak_temperature_K"] == pytest.approx(hottest, rel=1e-4)
+
+
+def test_coarse_levels_above_the_limit_are_warned_of_and_files_of_near_colours_stay_apart(tmp_path, capsys):
+    chip = "{sigma_px: 0.66, kernel_size: 5, max_temperature: 300 degC, rad_per_K: 0.03}"
+    run = tmp_path / "run"
+    words = [*SMALL, f"modulator={chip}", "wavelengths=[532.4 nm, 531.9 nm, 445 nm]", "--out", str(run)]
+    assert main(["run", *words]) == 0
+    capsys.readouterr()
+    assert main(["export-heaters", str(run)]) == 0 and "WARNING" not in capsys.readouterr().out
+    report = json.loads((run / "heaters" / "export.json").read_text())
+    names = [name for entry in report["files"] for name in entry["files"]]
+    assert len(names) == len(set(names)) == 3 * 3 * 3 and all((run / "heaters" / name).is_file() for name in names)
+    coarse = tmp_path / "coarse"
+    assert main(["export-heaters", str(run), "--bits", "1", "--out", str(coarse)]) == 0
+    assert "WARNING: rounded to 1 bits" in capsys.readouterr().out
+    report = json.loads((coarse / "export.json").read_text())
+    taps, peaks = torch.from_numpy(kernel(scale=1.0))[None, None], []
+    for entry in report["files"]:
+        if entry["quantity"] == "heater":
+            levels, about = read_levels(coarse / entry["files"][2])
+            driven = levels.double()[None, None] * about["step"]
+            peaks.append(torch.nn.functional.conv2d(driven, taps, padding=2).max().item())
+    assert report["peak_phase_of_levels_rad"] == pytest.approx(max(peaks), rel=1e-9)
+    assert max(peaks) > report["limit_rad"] == pytest.approx(300 * 0.03 * 630 / 532.4)
+
+
+def test_an_export_that_fails_leaves_no_files(tmp_path, capsys, monkeypatch):
+    run, out = tmp_path / "run", tmp_path / "out"
+    assert main(["run", *SMALL, "modulator={sigma_px: 0.66}", "--out", str(run)]) == 0
+    with monkeypatch.context() as patch:
+
+        def full(*_):
+            raise OSError(28, "No space left on device", "a.png")
+
+        patch.setattr("holotorch.experiments.panel.heaters.write_levels", full)
+        assert main(["export-heaters", str(run), "--out", str(out)]) != 0
+    assert not out.exists()
+    np.save(run / "arrays" / "phase.npy", np.load(run / "arrays" / "phase.npy")[..., 1:])
+    capsys.readouterr()
+    assert main(["export-heaters", str(run), "--out", str(out)]) == 2
+    assert "phase.npy must have the shape (F, C, H, W)" in capsys.readouterr().err and not out.exists()
+
+
+def test_the_view_of_an_own_chip_tells_its_temperature(tmp_path):
+    run = tmp_path / "run"
+    assert main(["run", *SMALL, "modulator={sigma_px: 0.66, rad_per_K: 0.03}", "--out", str(run)]) == 0
+    rises = json.loads((run / "summary.json").read_text())["methods"]["corrected"]["peak_temperature_rise_K"]
+    viewer = open_viewer(run)
+    with torch.no_grad():
+        seen = viewer.show({control.name: control.value for control in viewer.controls}, False, lambda: None)
+    assert seen.numbers["hottest pixel"] == f"{max(rises):.0f} degC above ambient"

@@ -26,7 +26,11 @@ class PECViewer(Viewer):
     def __init__(self, folder: Path, experiment: PECExperiment):
         self.title = "Corrected picture of a phased array"
         # An array of its own, whose heat changes with a control and is shared by the experiments at all distances.
-        self._array = PhasedArray(experiment.wavelengths, experiment.array.crosstalk)
+        self._array = PhasedArray(
+            experiment.wavelengths,
+            experiment.array.crosstalk,
+            reference_response=experiment.array.reference_response,
+        )
         self._experiment, self._assumed = replace(experiment, array=self._array), experiment.array.crosstalk
         # Of a measured kernel, the Gaussian that fits it best stands for it on the slider.
         given, kernel = experiment.settings.modulator.sigma_px, experiment.array.crosstalk.kernel
