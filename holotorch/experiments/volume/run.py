@@ -116,17 +116,22 @@ class _State:
         self.checkpoint.save({"sums": self.evaluation.sums, "count": self.evaluation.count, "rows": self.rows})
 
 
-def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> dict[str, Any]:
-    """Predicted and measured errors of a complete run, for the summary; none after an interruption."""
+def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> dict[str, Any] | None:
+    """Predicted and measured errors of all realisations, for the summary; None after an interruption.
+
+    None are measured if memory is short, since all else is computed by then.
+    """
     if pressed or state.evaluation.count < experiment.settings.report.seeds:
-        return {}
+        return None
     hologram = torch.from_numpy(np.load(state.out / "arrays" / "hologram.npy")).to(experiment.device)
     depths = state.evaluation.depths
     try:
         return error_values(
             [hologram_error(experiment), refocusing_error(experiment, hologram, depths[len(depths) // 2])]
         )
-    except (KeyboardInterrupt, MemoryError):  # all else is computed, so that the run is complete without it
+    except KeyboardInterrupt:
+        return None
+    except MemoryError:
         return {}
     except RuntimeError as error:  # torch's own way to say so
         if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
@@ -134,7 +139,8 @@ def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> di
         return {}
 
 
-def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, errors: dict[str, Any]) -> bool:
+def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, errors: dict[str, Any] | None) -> bool:
+    """Fill the folder; without ``errors`` the run is not complete, and resuming it measures them."""
     out, files, evaluation = opened.path, Results(), state.evaluation
     files.write(write_table, out / "metrics.csv", state.rows)
     pictures = evaluation.pictures
@@ -161,9 +167,8 @@ def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, error
         "synthetic": experiment.synthetic,
         "refocused_m": evaluation.depths,
         **evaluation.numbers(),
-        **errors,
+        **(errors or {}),
         **{name: round(sum(row[name] for row in state.rows), 3) for name in seconds},
         "peak_memory_bytes": peak_memory(),
     }
-    done = evaluation.count == experiment.settings.report.seeds
-    return conclude(opened, summary, files, done=done, checkpoint=state.checkpoint)
+    return conclude(opened, summary, files, done=errors is not None, checkpoint=state.checkpoint)

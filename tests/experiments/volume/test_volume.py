@@ -112,6 +112,16 @@ def test_interrupted_and_resumed_is_the_same_to_the_bit(tmp_path, monkeypatch, c
     assert main(["resume", str(tmp_path / "b")]) == 0
 
 
+def test_an_interruption_while_errors_are_measured_leaves_them_to_resuming(tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(volume_run, "refocusing_error", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        assert not execute(settings(), tmp_path / "a", "a")[1]
+    assert "measured_error" not in json.loads((tmp_path / "a" / "interrupted.json").read_text())
+    assert main(["resume", str(tmp_path / "a")]) == 0
+    assert json.loads((tmp_path / "a" / "summary.json").read_text())["measured_error"] > 0
+
+
 def test_several_processes_give_what_one_gives(tmp_path):
     words = [str(CONFIGS / "tooth.yaml"), *TINY[:2], TINY[2].replace("[64, 48]", "[64, 64]"), TINY[3]]
     assert main(["run", *words, "--out", str(tmp_path / "one")]) == 0
