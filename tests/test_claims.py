@@ -1,4 +1,4 @@
-"""Every figure of the README has a claim; claims and tables of guides are borne out by the files of the last runs."""
+"""Figures of README and guides have a claim; claims and tables are borne out by the files of the last runs."""
 
 import importlib.util
 import re
@@ -21,6 +21,7 @@ def load_claims():
 CLAIMS = load_claims()
 VERDICTS = CLAIMS.verdicts()
 CELLS = CLAIMS.cells()
+QUOTES = CLAIMS.quotes()
 
 
 def rows() -> list[str]:
@@ -55,6 +56,85 @@ def test_lines_of_verdict_in_a_guide_are_those_of_the_last_run(path):
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.guide}: {cell.row[2:34]}")
 def test_a_number_in_a_table_of_a_guide_is_that_of_the_last_run(cell):
     assert cell.holds, cell
+
+
+@pytest.mark.parametrize("quote", QUOTES, ids=lambda quote: f"{quote.guide}: {quote.says[:40]}")
+def test_a_result_in_the_prose_of_a_guide_is_borne_out(quote):
+    assert quote.holds, quote
+    assert not quote.untested, "numbers without a test; those that are settings go into the row's list 'given'"
+
+
+@pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.stem)
+def test_a_number_in_the_prose_of_a_guide_has_a_row(path):
+    """A number that looks measured is in a quote of prose.yaml: of a result, of what is not measured, or of a test."""
+    assert not CLAIMS.uncovered(path.stem), "add a row to scripts/charts/claims/prose.yaml"
+
+
+def test_files_of_the_lists_of_tests_are_there():
+    missing = [file for row in CLAIMS.load(CLAIMS.FOLDER / "prose.yaml") for file in row.get("in_tests", {}).values()]
+    assert missing and all((ROOT / file).is_file() for file in missing)
+
+
+@pytest.fixture
+def prose(tmp_path):
+    """A function that judges a guide by rows for it: verdicts, untested numbers, and numbers without a row."""
+
+    def judge(guide: str, rows: str):
+        (tmp_path / "guide.md").write_text(guide)
+        (tmp_path / "run.csv").write_text("m,x\na,0.514\nb,0.257\n")
+        (tmp_path / "prose.yaml").write_text(rows)
+        found = CLAIMS.quotes(tmp_path, tmp_path)
+        bare = CLAIMS.uncovered("guide", tmp_path, tmp_path)
+        return [quote.holds for quote in found], [each for quote in found for each in quote.untested], len(bare)
+
+    return judge
+
+
+ROW = """
+- guide: guide
+  says: "SSIM is {shown} at sigma 0.66"
+  command: x
+  file: run.csv
+  given: ["0.66"]
+  tests: [{{shows: "{shown}", column: x, rows: {{m: a}}}}]
+"""
+
+
+def test_a_number_in_prose_that_its_file_contradicts_is_caught(prose):
+    assert prose("The SSIM\nis 0.51 at sigma 0.66.\n", ROW.format(shown="0.51")) == ([True], [], 0)
+    assert prose("The SSIM\nis 0.52 at sigma 0.66.\n", ROW.format(shown="0.52")) == ([False], [], 0)
+    assert prose("The SSIM is 0.514 at sigma 0.66.", ROW.format(shown="0.514").replace("given", "other"))[1] == ["0.66"]
+    with pytest.raises(ValueError, match="0 times 'SSIM is 0.51 at sigma 0.66'"):
+        prose("The SSIM is 0.52 at sigma 0.66.", ROW.format(shown="0.51"))
+    tests = """
+    - {shows: "2", find: "a,([0-9.]+)", over: "b,([0-9.]+)"}
+    - {shows: "50", column: x, rows: {m: a}, minus: {column: x, rows: {m: b}}, over: "a,([0-9.]+)", scale: 100}
+    - {shows: "39", column: x, rows: {}, take: mean, scale: 100}
+    - {at_most: 6, column: x, rows: {}, take: max}
+"""
+    row = f"- guide: guide\n  says: 2 times, 50 %, 39 ms, 6\n  command: x\n  file: run.csv\n  tests:{tests}"
+    assert prose("It takes 2 times, 50 %, 39 ms, 6.", row) == ([True], [], 0)
+
+
+LOOK_MEASURED = (
+    "error of 0.3",
+    "below 1e-3",
+    "18 % off",
+    "14 dB more",
+    "20 times as fast",
+    "3 of 48 fail",
+    "4 to 5 ms",
+)
+
+
+@pytest.mark.parametrize("text", LOOK_MEASURED)
+def test_a_number_in_prose_without_a_row_is_caught(text, prose):
+    none, row = "- {guide: guide}", f"- {{guide: guide, not_measured: ['{text}']}}"
+    assert prose(f"So: {text}.", none)[2] > 0
+    assert prose(f"So: {text}.", row)[2] == 0
+    assert prose(f"| {text} |\n\n    {text}\n\n```\n{text}\n```\n`{text}`, Sec. 3.4, Figs. 2.3 and 2.4.", none)[2] == 0
+    with pytest.raises(ValueError, match="no longer there"):
+        prose("So.", row)
 
 
 def test_a_number_in_a_table_that_its_file_contradicts_is_caught(tmp_path):
