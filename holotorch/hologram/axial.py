@@ -83,10 +83,12 @@ class AxialHologram(LayerHologram):
     multiplied by the same propagation factor from each node to the next. Finally the sum is multiplied by the spectrum
     of the spherical wave and transformed back. Evenly spaced planes serve as nodes themselves if this is cheaper.
 
-    Arguments as for :class:`LayerHologram`, except:
+    Args:
         cone: "taper", "band" or "full". "full" is allowed only if every pixel lies within the cone of every source,
             since this method leaves out light outside the cone.
         tolerance: Largest relative L2 error of the field for random sources; complex64 reaches 1e-6 at best.
+
+    The other arguments are those of :class:`LayerHologram`.
 
     Raises:
         TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w], or so wide

@@ -139,7 +139,7 @@ class ThermalCrosstalk(PreciseModule):
 
     @property
     def total(self) -> float:
-        """Sum of the kernel: ratio of phase to heater phase in a uniformly heated, infinite array."""
+        """Sum of the kernel, which is the ratio of phase to heater phase in a uniformly heated, infinite array."""
         return self.kernel.sum().item()
 
     @property

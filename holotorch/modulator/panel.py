@@ -94,7 +94,7 @@ class PhaseModulator(PreciseModule):
         flip_columns: The same for columns.
         crosstalk: Fringing kernel: the standard deviation in pixels of a Gaussian, a measured kernel [h, w], see
             :meth:`ThermalCrosstalk.from_patch`, or a ``ThermalCrosstalk``, which may learn.
-        birefringence: Birefringence of the crystal, see :func:`holotorch.modulator.dispersion.phase_scale`. With None
+        birefringence: Birefringence of the crystal, see :func:`phase_scale`. With None
             the phase is the same for every wavelength, as in the thesis's simulation.
         learnable: Make the table a Parameter, ``lut``.
 

@@ -75,8 +75,8 @@ def overlaps(centres_deg: Any, size_deg: Any) -> tuple[Tensor, Tensor]:
     The arguments [N, 2] are those of :func:`scale_layout`.
 
     Returns:
-        Indices of the K overlapping pairs, [K, 2], the lower index first, and the overlap of each pair, [K]: the
-        smallest visual angle in degrees by which one box must move, in elevation or azimuth, to separate them.
+        Indices of the K overlapping pairs, [K, 2], the lower index first, and the overlap of each pair, [K], which is
+        the smallest visual angle in degrees by which one box must move, in elevation or azimuth, to separate them.
     """
     centres, sizes = _items(centres_deg, size_deg)
     first, second = torch.triu_indices(len(centres), len(centres), 1, device=centres.device)

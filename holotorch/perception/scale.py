@@ -22,7 +22,8 @@ class EqualEfficiencyScale:
     Attributes:
         alpha: Slope in degrees of size per degree of eccentricity, a number or a scalar tensor.
         beta: Intercept in degrees, a number or a scalar tensor.
-        low_deg, high_deg: Smallest and greatest eccentricity at which the line is valid.
+        low_deg: Smallest eccentricity at which the line is valid.
+        high_deg: Greatest such eccentricity.
         covariance: Covariance of (alpha, beta), [2, 2]; None for the lines of Table 2.2, which does not print it.
 
     Source: thesis Sec. 2.4.3.

@@ -82,13 +82,13 @@ class _Table:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power of a source against wavelength, from :meth:`lorentzian`, :meth:`gaussian`, :meth:`table` or a preset.
+    """Power of a source against wavelength, from :meth:`Spectrum.lorentzian`, ``gaussian``, ``table`` or a preset.
 
     Power below ``cutoff`` times the peak is dropped, and the remaining band is normalized to unit power, so that images
     under different sources are compared at equal power (text below Eq. 5.16).
 
     The presets, such as ``Spectrum.laser(636e-9)``, are Lorentzian with the full widths at half maximum of Table 5.1.
-    Eq. 5.15 as printed uses these numbers as half widths, which :meth:`lorentzian_as_printed` reproduces.
+    Eq. 5.15 as printed uses these numbers as half widths, which :meth:`Spectrum.lorentzian_as_printed` reproduces.
 
     Attributes:
         centre: Wavelength of the peak, in metres.

@@ -30,7 +30,7 @@ class LinePose:
 
     @property
     def tip_sd(self) -> float:
-        """Standard deviation of the tip in metres: the root of the sum of the variances of all three axes."""
+        """Standard deviation of the tip in metres, the root of the sum of the variances of all three axes."""
         return float(np.sqrt(self.covariance.diagonal()[:3].sum()))
 
 

@@ -18,7 +18,7 @@ class OneEuro:
     direction moves by the fraction alpha along the great circle to the new one. The cutoff of both is ``min_cutoff +
     beta * speed``, where the speed is that of the tip or of the point ``arm`` behind it, whichever is larger.
 
-    For a steady motion, the smoothed pose is :attr:`lag` seconds late, where lag' = (1 - alpha) (lag + dt) converges to
+    For a steady motion, the smoothed pose is ``lag`` seconds late, where lag' = (1 - alpha) (lag + dt) converges to
     tau. With the defaults and 60 frames per second, white jitter at rest falls to a third, and the lag is 80 ms at rest
     and 13 ms at 50 mm/s.
 

@@ -33,7 +33,7 @@ class Status(enum.IntEnum):
 
     @property
     def stage(self) -> str:
-        """Stage that decided the status: "frame", "colour", "axis", "edges", "camera" or "pose"."""
+        """Stage that decided the status, one of "frame", "colour", "axis", "edges", "camera" or "pose"."""
         return _STAGES[self]
 
 
@@ -101,12 +101,12 @@ class Pose:
 
     @property
     def tip_sd(self) -> Tensor:
-        """Standard deviation of the tip in metres [...]: the root of the sum of the variances of all three axes."""
+        """Standard deviation of the tip in metres [...], the root of the sum of the variances of all three axes."""
         return self.covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
 
     @property
     def camera_from_tool(self) -> Tensor:
-        """Rigid map [..., 4, 4]: the origin to the tip and, by the smallest rotation, the z axis to the direction."""
+        """Rigid map [..., 4, 4] that takes the origin to the tip and, by the smallest rotation, z to the direction."""
         x, y, z = self.direction.unbind(-1)
         square = x * x + y * y
         opposite = (z < 0) & (square < 1e-30)  # no unique smallest rotation: by 180 degrees about x

@@ -60,7 +60,8 @@ class PhotometricPose:
     """Fitted poses of B frames, with what each of the N edges says about them.
 
     Attributes:
-        tip, direction: [B, 3], in metres; unit vectors from the tip to the rear. NaN where the fit has not converged.
+        tip: [B, 3], in metres; NaN where the fit has not converged.
+        direction: [B, 3], unit vectors from the tip to the rear; NaN as well.
         covariance: [B, 6, 6] of tip and direction.
         blur: [B] standard deviation of the point spread, in pixels.
         misfit: [B, N] mean squared residual of each edge's window in squared levels.

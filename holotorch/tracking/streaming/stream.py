@@ -72,7 +72,7 @@ class PoseSender:
             lag: Delay in seconds that smoothing added.
 
         Raises:
-            ValueError, TypeError: As :func:`packet.encode`.
+            ValueError, TypeError: As :func:`~holotorch.tracking.streaming.packet.encode`.
         """
         number = next(self._sequence)
         data = encode(PosePacket(pose, captured, now(), number, self.stream, self.frame, lag))
