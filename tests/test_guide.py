@@ -31,6 +31,25 @@ class Links(HTMLParser):
             self.loads.append(source)
 
 
+def printed(page: str) -> str:
+    """What the Python of a page about a task prints."""
+    text = (BUILD.parent / "tasks" / page).read_text(encoding="utf-8")
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.S))
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_numbers_of_a_design_are_those_on_its_page():
+    text = printed("design_a_display.md")
+    assert [each for each in ("7.97 deg", "10.94 deg", "at 0.36 m", "93.3 mm", "10 nm") if each not in text] == []
+
+
+def test_the_network_of_its_page_learns():
+    losses = [float(line.split()[1]) for line in printed("train_with_it.md").splitlines()]
+    assert losses[-1] < 0.5 * losses[0]
+
+
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory) -> dict[Path, Links]:
     pytest.importorskip("sphinx_gallery", reason="the guide needs pip install 'holotorch[docs]'")
