@@ -59,7 +59,7 @@ def stage(source: Path, *, quick: bool) -> None:
 
 def main() -> int:
     """Build; the exit status is that of Sphinx, or 2 if it is not installed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
         "--quick", action="store_true", help="show the committed pictures; run no script of the gallery"
     )

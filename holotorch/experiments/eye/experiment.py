@@ -243,7 +243,14 @@ class Observer:
 
 
 def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Observer:
-    """Build the scene and resolve the depths of focus. ConfigError if nothing is visible or the eye cannot focus."""
+    """Build the scene and resolve the depths of focus.
+
+    ConfigError for a pitch below half a wavelength, if nothing is visible, or if the eye cannot focus.
+    """
+    pitch, longest = min(scene_settings.hologram.pitch), max(scene_settings.wavelengths)
+    if pitch <= longest / 2:
+        words = f"expected more than {longest / 2:.4g} m, half the longest wavelength, got {pitch:g} m"
+        raise ConfigError([f"hologram.pitch: {words}"])
     budget = observer_budget(settings, scene_settings)
     # An eye sees the hologram itself: the tolerance of a scene, too, is that of its hologram alone.
     hologram = scene_settings.hologram.model_copy(update={"tolerance": budget.share(HOLOGRAM)})

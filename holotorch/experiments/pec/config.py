@@ -123,7 +123,7 @@ class _SolverSettings(Settings):
     """
 
     kind: Any  # name of the solver, stated by each of the classes below
-    max_steps: Count = 400
+    max_steps: Annotated[Count, Field(le=100000)] = 400
     tolerance: Annotated[Number, Field(ge=0)] = 1e-3
     patience: Count = 10
     start: Start | None = None
@@ -152,7 +152,7 @@ class LBFGSSettings(_SolverSettings):
 
     kind: Literal["lbfgs"]
     memory: Annotated[Count, Field(le=100)] = 3
-    max_steps: Count = 300
+    max_steps: Annotated[Count, Field(le=100000)] = 300
     tolerance: Annotated[Number, Field(ge=0)] = 1e-4
 
 

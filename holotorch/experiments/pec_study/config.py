@@ -54,5 +54,5 @@ class StudySettings(Settings):
     images: Annotated[tuple[Picture, ...], BeforeValidator(_photographs), Field(min_length=1)]
     size: Annotated[Count, Field(ge=24, le=1024)] = 128
     sweep: Annotated[tuple[Annotated[Number, Field(gt=0, le=3)], ...], BeforeValidator(several), Field(min_length=1)]
-    max_steps: Count = 400
+    max_steps: Annotated[Count, Field(le=100000)] = 400
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 7

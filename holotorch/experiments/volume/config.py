@@ -6,16 +6,19 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
+from holotorch.core.quantities import WIDTH
 from holotorch.experiments.config.settings import (
     Count,
     Distance,
     ExistingArray,
     ExistingPath,
     GridSettings,
+    Length,
     Number,
     Settings,
     Wavelength,
     number,
+    plausible,
     several,
 )
 
@@ -105,7 +108,7 @@ class ViewSettings(Settings):
 
     azimuth_deg: Number = 0.0
     elevation_deg: Number = 0.0
-    width: Depth | None = None
+    width: Annotated[Length, plausible(WIDTH)] | None = None
     front: Literal["far", "near"] = "far"
     lighting: bool = False
     scattering: ScatteringSettings | None = None

@@ -252,6 +252,10 @@ def test_a_scene_that_the_display_cannot_show_is_refused():
     wrong = settings("focus=[40 mm]")  # beyond the eyepiece
     with pytest.raises(ConfigError, match=r"display: .*; the eye cannot focus at a depth of 40 mm"):
         observer(wrong, scene_settings(wrong))
+    finer = scene_settings(settings())
+    finer = finer.model_copy(update={"hologram": finer.hologram.model_copy(update={"pitch": (3e-7, 3e-7)})})
+    with pytest.raises(ConfigError, match=r"hologram.pitch: expected more than .* half the longest wavelength"):
+        observer(settings(), finer)
     other = settings("scene={config: configs/demo.yaml}")
     with pytest.raises(ConfigError, match="describes no volume but 'pec'"):
         scene_settings(other)
