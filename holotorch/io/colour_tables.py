@@ -81,3 +81,27 @@ def white_balance(wavelengths: Sequence[float]) -> Tensor:
         listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
         raise ValueError(f"{listed} nm cannot be mixed to the white D65; take one red, one green and one blue source")
     return powers / powers.max()
+
+
+def picture_matrix(wavelengths: Sequence[float]) -> Tensor:
+    """Matrix [3, K] from intensities at K = 1, 2 or 3 wavelengths to the linear sRGB of a picture, float64.
+
+    Equal intensities at three wavelengths are neutral grey, see :func:`white_balance`. Two wavelengths are shown in
+    their own colours, each as bright as sRGB holds it and mixed with grey as by ``optics.gamut_map``. A single one is
+    shown in grey, whatever its colour.
+
+    Raises:
+        ValueError: Another number of wavelengths, or wavelengths that have no colour or cannot be mixed to white.
+    """
+    if len(wavelengths) == 1:
+        return torch.ones(3, 1, dtype=torch.float64)
+    if len(wavelengths) == 3:
+        return srgb_matrix(wavelengths, white_balance(wavelengths))
+    if len(wavelengths) != 2:
+        raise ValueError(f"expected 1, 2 or 3 wavelengths, got {len(wavelengths)}: a picture has three channels")
+    columns = []
+    for wavelength in wavelengths:
+        colour = srgb_matrix([wavelength])[:, 0]  # of luminance 1, as is grey [1, 1, 1]
+        inside = 1 + (colour - 1) / (1 - colour.min().clamp(max=0))
+        columns.append(inside / inside.max())
+    return torch.stack(columns, 1).clamp(min=0)

@@ -78,7 +78,7 @@ def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str)
     sections = _options_at(model, location[:-2])
     kinds = [tag for section in sections if name in section.model_fields for tag in _tags(section)]
     if kinds and len(location) > 2:
-        whole = f"to change the kind give the whole section, as in '{location[-3]}={{kind: {location[-2]}}}'"
+        whole = f"to change the kind give the whole section, as in '{location[-3]}={{kind: {kinds[0]}}}'"
         return f"a setting of kind {' and '.join(kinds)}, not of {location[-2]}; {whole}"
     known = [key for section in _options_at(model, location[:-1]) for key in section.model_fields]
     return "unknown setting" + nearest(name, known)

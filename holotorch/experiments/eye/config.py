@@ -7,7 +7,17 @@ from pydantic_core import PydanticCustomError
 
 from holotorch.core.quantities import DEPTH, EYE_LENGTH, FOCAL_LENGTH, PUPIL_RADIUS, SPACING
 from holotorch.experiments.config.errors import short
-from holotorch.experiments.config.settings import Count, Length, Number, Settings, existing, number, plausible, several
+from holotorch.experiments.config.settings import (
+    Count,
+    Length,
+    Number,
+    Settings,
+    Wavelength,
+    existing,
+    number,
+    plausible,
+    several,
+)
 from holotorch.experiments.volume.config import TransferSettings, VolumeSource
 from holotorch.io.bundled import find_config
 
@@ -116,7 +126,7 @@ class ObserverSettings(Settings):
     """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
     ``volume``: a volume of your own in place of the scene's, as in runs of kind volume. ``transfer``: its colours and
-    opacities, as there.
+    opacities, as there. ``wavelengths``: those of the hologram, in place of the scene's.
     ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the visible
     depths. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times as
     many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina, divided between
@@ -131,6 +141,7 @@ class ObserverSettings(Settings):
     scene: SceneSettings
     volume: VolumeSource | None = None
     transfer: TransferSettings | None = None
+    wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)] | None = None
     display: Annotated[MagnifyingSettings | PlanarSettings | SphericalSettings, Field(discriminator="kind")]
     eye: EyeSettings = EyeSettings()
     light: LightSettings = LightSettings()

@@ -17,6 +17,7 @@ from holotorch.experiments.planning.tolerance import Budget, Part
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import pooled
 from holotorch.experiments.volume.experiment import HOLOGRAM, VolumeExperiment, build
+from holotorch.io.colour_tables import picture_matrix
 from holotorch.metrics import sharpness, speckle_contrast, ssim
 from holotorch.modulator import phase_scale
 from holotorch.optics.light.coherence import optimum_fwhm, path_difference, predicted_contrast
@@ -95,8 +96,9 @@ class Observer:
 
     @property
     def reference_wavelength(self) -> float:
-        """The middle one of the three wavelengths in metres, for which an eye with chromatic aberration is in focus."""
-        return sorted(self.scene.settings.wavelengths)[1]
+        """The middle one of the wavelengths in metres, for which an eye with chromatic aberration is in focus."""
+        wavelengths = sorted(self.scene.settings.wavelengths)
+        return wavelengths[len(wavelengths) // 2]
 
     def aperture(self, depth: float) -> float:
         """Sine of the half angle of the light cone from a point at a depth to the eye, limited by pupil or hologram."""
@@ -179,9 +181,9 @@ class Observer:
         return self._retina_plans[depth]
 
     def image(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
-        """Intensity on the retina of an eye focused at a depth (metres), averaged around each scene ray, [3, h, w].
+        """Intensity on the retina of an eye focused at a depth (metres), averaged around each scene ray, [C, h, w].
 
-        ``hologram`` is complex [3, H, W]. Without a source, each colour has a single wavelength.
+        ``hologram`` is complex [C, H, W]. Without a source, each colour has a single wavelength.
         """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
         elements = self.retina(depth).method == "elements"
@@ -218,7 +220,7 @@ class Observer:
     def row(self, source: str, depth: float, pictures: Tensor, reference: Tensor) -> dict[str, Any]:
         """Measurements of a source with the eye focused at a depth (metres): for each quantity, a value per colour.
 
-        The values are means over the S realisations in ``pictures`` [S, 3, h, w]; ``reference`` [3, h, w] is free of
+        The values are means over the S realisations in ``pictures`` [S, C, h, w]; ``reference`` [C, h, w] is free of
         speckle.
         """
         peak = reference.amax((-2, -1), keepdim=True)
@@ -256,6 +258,10 @@ def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Obse
     hologram = scene_settings.hologram.model_copy(update={"tolerance": budget.share(HOLOGRAM)})
     scene = build(scene_settings.model_copy(update={"hologram": hologram, "tolerance": None}))
     budget.predict(HOLOGRAM, max(plan.predicted_error for plan in scene.plans))
+    try:
+        picture_matrix(scene_settings.wavelengths)
+    except ValueError as error:
+        raise ConfigError([f"wavelengths: {error}"]) from error
     focus = settings.focus
     if focus is None:
         depth = scene.sampler().depth_map(scene.volume)

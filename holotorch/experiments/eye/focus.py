@@ -1,6 +1,7 @@
 """A sweep of the eye's focus over a scene: the focus at which each part looks sharpest (thesis Fig. 5.9)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,6 +16,7 @@ from holotorch.experiments.eye.config import SweepSettings
 from holotorch.experiments.eye.experiment import Observer
 from holotorch.experiments.eye.tradeoff import parabola_peak
 from holotorch.experiments.runs.figures import figure_png
+from holotorch.experiments.runs.pictures import in_colour
 
 _BLUR = 6.0  # standard deviation, in rays, of the blurred picture that is subtracted to compare only fine detail
 _OPAQUE = 0.5  # opacity above which a ray shows a surface
@@ -62,7 +64,7 @@ class FocusSweep:
 
     Attributes:
         depths: F depths of the focus in metres from the hologram.
-        pictures: Intensity at the rays for each focus, [F, 3, h, w], mean over the realisations.
+        pictures: Intensity at the rays for each focus, [F, C, h, w], mean over the realisations.
         bands: Bands in order of increasing depth.
     """
 
@@ -76,7 +78,7 @@ class Surface:
     """The visible surface of a scene.
 
     Attributes:
-        rendering: Rendering of the scene, [3, h, w].
+        rendering: Rendering of the scene, [C, h, w].
         opaque: Whether a ray shows the surface, [h, w].
         depth: Depth of the surface along each ray in metres from the hologram, [h, w].
         ends: 2 and 98 % quantiles of the depth of the surface in metres.
@@ -90,10 +92,9 @@ class Surface:
 
 def visible_surface(eye: Observer) -> Surface:
     """The visible surface of a scene. ValueError for a scene without a surface, or with a surface at a single depth."""
-    sampler = eye.scene.sampler()
+    rendering, opacity = eye.scene.rendering()
     with torch.no_grad():
-        rendering, opacity = (part.cpu() for part in sampler.render(eye.scene.volume))
-        depth = sampler.depth_map(eye.scene.volume).cpu()
+        depth = eye.scene.sampler().depth_map(eye.scene.volume).cpu()
     opaque = opacity > _OPAQUE
     shown = depth[opaque].sort().values
     if len(shown) < _LEAST:
@@ -149,7 +150,7 @@ def in_words(sweep: FocusSweep) -> list[str]:
     ]
 
 
-def draw(sweep: FocusSweep) -> bytes:
+def draw(sweep: FocusSweep, wavelengths: Sequence[float]) -> bytes:
     """PNG: correlation of each band against the focus, and pictures focused on the first, middle and last band."""
     figure = Figure(figsize=(17, 4.6), layout="constrained")
     curves, *views = figure.subplots(1, 4, width_ratios=(1.3, 1, 1, 1))
@@ -165,7 +166,7 @@ def draw(sweep: FocusSweep) -> bytes:
     count = len(sweep.bands)
     for view, band in zip(views, (sweep.bands[0], sweep.bands[count // 2], sweep.bands[-1]), strict=True):
         nearest = min(range(len(positions)), key=lambda f: abs(sweep.depths[f] - band.depth))
-        picture = (sweep.pictures[nearest] / bright).clamp(0, 1).sqrt()
+        picture = in_colour((sweep.pictures[nearest] / bright).clamp(0, 1).sqrt(), wavelengths).clamp(0, 1)
         view.imshow(picture.movedim(0, -1).numpy(), interpolation="nearest")
         view.set_title(f"focus {positions[nearest]:.2f} mm", fontsize=10)
         view.set_axis_off()
@@ -173,7 +174,7 @@ def draw(sweep: FocusSweep) -> bytes:
 
 
 def _fine_detail(pictures: Tensor) -> Tensor:
-    """Pictures [F, 3, h, w] minus their Gaussian blur."""
+    """Pictures [F, C, h, w] minus their Gaussian blur."""
     blur: Any = (0, 0, _BLUR, _BLUR)
     return pictures - torch.from_numpy(gaussian(pictures.numpy(), sigma=blur))
 

@@ -12,7 +12,7 @@ from holotorch.experiments.eye.experiment import PRESETS, Observer
 from holotorch.experiments.runs.figures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
 
-_COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of the three wavelengths
+_COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of up to three wavelengths
 _ROMAN = ("none", "I", "II", "III")  # names of the regions 0 to 3 of ``display_geometry.region``
 _REGIONS = (  # meanings of the regions
     "no light of the point reaches the hologram",
@@ -21,6 +21,7 @@ _REGIONS = (  # meanings of the regions
     "the cone of light covers the whole hologram, so spots grow with distance",
 )
 _INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller fraction of its light enters the pupil
+_LITTLE = 0.01  # share of the light of the scene's centre in the pupil below which pictures are dim
 
 
 def geometry(eye: Observer) -> dict[str, Any]:
@@ -46,6 +47,8 @@ def geometry(eye: Observer) -> dict[str, Any]:
     # The pitch or the width of the hologram limits the half angle of the light cone of a point.
     sines = [min(w / (2 * pitch), math.sin(math.atan(width / 2 / scene.distance))) for w in wavelengths]
     values["eye_box_mm"] = [1e3 * viewing.eye_box(scene.width, first, second, sine) for sine in sines]
+    spread = abs(second) * np.array(sines)  # radius of the light of the scene's centre on the pupil's plane
+    values["light_in_pupil"] = [float(min(1.0, pupil / each) ** 2) for each in spread]
     values["light_of_edge"] = [viewing.vignetting(scene.width / 2, first, second, pupil, sine) for sine in sines]
     if isinstance(display, MagnifyingSettings):
         to_lens = float(eye.display.lens_distance) - scene.distance
@@ -87,12 +90,23 @@ def in_words(values: dict[str, Any]) -> list[str]:
         f"the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near "
         f"end, {spots[1]} um at the far end",
     ]
+    return [*lines, *(f"WARNING    {words}" for words in warnings(values))]
+
+
+def warnings(values: dict[str, Any]) -> list[str]:
+    """What spoils the pictures, from the result of :func:`geometry`."""
+    found = []
     if min(values["light_of_edge"]) < _INVISIBLE:
-        lines.append(
-            "WARNING    the edge of the scene is invisible to this eye; enlarge eye.pupil_radius or narrow the scene "
+        found.append(
+            "the edge of the scene is invisible to this eye; enlarge eye.pupil_radius or narrow the scene "
             "(view.width of its configuration)"
         )
-    return lines
+    if (least := min(values["light_in_pupil"])) < _LITTLE:
+        found.append(
+            f"only {100 * least:.2g} % of the light of the scene's centre enters the pupil: pictures are dim; enlarge "
+            "eye.pupil_radius, or move eye or lens"
+        )
+    return found
 
 
 def _accommodation_mm(eye: Observer, depth: float) -> float | None:
@@ -110,7 +124,7 @@ def draw(eye: Observer) -> bytes:
     _draw_display(along, eye)
     _draw_regions(regions, eye)
     for source in eye.settings.light.sources:
-        for wavelength, colour in zip(eye.scene.settings.wavelengths, _COLOURS, strict=True):
+        for wavelength, colour in zip(eye.scene.settings.wavelengths, _COLOURS, strict=False):
             spectrum = PRESETS[source](wavelength)
             band = np.linspace(*spectrum.band(), 201)
             power = spectrum.power(band).numpy()

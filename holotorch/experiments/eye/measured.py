@@ -10,7 +10,6 @@ from holotorch.experiments.volume.plan import hologram_seconds
 from holotorch.optics.light.spectral import spectral_image
 
 _STEP = 1e-9  # metres between the wavelengths of the reference
-_COLOUR = 1  # the middle one
 
 
 def observer_errors(eye: Observer) -> list[Comparison]:
@@ -29,7 +28,8 @@ def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
     In the reference each wavelength in steps of 1 nm is propagated, by the method of the plan. ``limit`` is in seconds
     on the reference machine of ``planning.machine``.
     """
-    depth, wavelength = eye.focus[len(eye.focus) // 2], eye.scene.settings.wavelengths[_COLOUR]
+    colour = len(eye.scene.settings.wavelengths) // 2
+    depth, wavelength = eye.focus[len(eye.focus) // 2], eye.scene.settings.wavelengths[colour]
     every = {source: PRESETS[source](wavelength).every(_STEP) for source in eye.settings.light.sources}
     source = max(every, key=lambda name: len(every[name][0]))
     lengths, weights = every[source]
@@ -44,7 +44,7 @@ def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
     if seconds(Machine()) > limit:
         return not_measured(WAVELENGTHS, predicted, seconds(machine_speed(eye.scene.device)))
     few = eye.samples(source, wavelength, depth)
-    light = eye.scene.hologram(eye.settings.seed)[0][_COLOUR].conj()
+    light = eye.scene.hologram(eye.settings.seed)[0][colour].conj()
     setup, elements = (eye.display, eye.eye(depth)), plan.method == "elements"
     images = [
         spectral_image(light, eye.scene.grid, *spectrum, *setup, count=count, elements=elements)

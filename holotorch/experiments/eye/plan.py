@@ -9,6 +9,7 @@ from holotorch.experiments.planning.machine import machine_speed, seconds_in_wor
 from holotorch.experiments.runs.memory import shortage
 from holotorch.experiments.runs.page import plain
 from holotorch.experiments.volume import plan as volume_plan
+from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.optics.viewing.imaging import retinal_scale
 
 # Costs on one core of the reference machine of ``planning.machine``.
@@ -49,6 +50,7 @@ def plan_values(eye: Observer) -> dict[str, Any]:
         ),
         "start-up and figures": machine.around(figures=2 + len(retina)),
     }
+    geometry = eye_geometry.geometry(eye)
     peaks = [_BASE_BYTES + _MARGIN * each.memory_bytes + _DERIVED_BYTES * pixels for each in retina]
     return {
         "scene": _scene(eye),
@@ -71,14 +73,29 @@ def plan_values(eye: Observer) -> dict[str, Any]:
         "predicted_seconds": round(sum(seconds.values()), 1),
         "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
         "predicted_peak_bytes": round(max(volume["predicted_peak_bytes"], *peaks)),
-        "geometry": eye_geometry.geometry(eye),
+        "geometry": geometry,
+        "warnings": [*eye_geometry.warnings(geometry), *_shallow(eye), *volume_plan.dark_picture(scene)],
     }
+
+
+def _shallow(eye: Observer) -> list[str]:
+    """A warning if the eye sees all depths of the scene about equally sharp; otherwise none."""
+    depths, wavelength = eye.scene.depths, min(eye.scene.settings.wavelengths)
+    deep, middle = max(depths) - min(depths), (max(depths) + min(depths)) / 2
+    if not 0 < deep < (focus := depth_of_focus(wavelength, eye.detail(middle, wavelength))):
+        return []
+    return [
+        f"the scene is {deep * 1e3:.3g} mm deep and this eye's depth of focus there {focus * 1e3:.3g} mm: focusing "
+        "makes no visible difference; use a deeper scene, a smaller distance, a wider hologram or pupil, or finer rays"
+    ]
 
 
 def _scene(eye: Observer) -> str:
     """The volume in words: an own one in the setting of the scene, or the scene's."""
     scene, own = eye.settings.scene.config, eye.settings.volume
     words = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
+    if changes := eye.settings.scene.change:
+        words += f" and scene.change: {', '.join(changes)}"
     return "; ".join(filter(None, (words, volume_plan.preset_note(eye.scene))))
 
 
@@ -100,6 +117,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         where = f" (largest error, at {depth:.4g} mm)" if len(plans) > 1 else ""
         only = f" (focus {', '.join(f'{depth:.4g}' for depth, _ in plans)} mm)" if len(plans) < len(depths) else ""
         lines.append(f"Retina     {worst['reason']}{where}{only}; alternative: {worst['runner_up']}")
+    lines += volume_plan.colours_in_words(eye.scene.settings.wavelengths)
     light = "; ".join(
         f"{name}: {plain(values['followed'][name])} of {plain(count)} wavelengths simulated"
         for name, count in values["wavelengths"].items()
@@ -121,12 +139,13 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     if sweep := settings.sweep:
         lines.append(
             f"Sweep      in addition, {sweep.steps} depths of focus, {sweep.realisations} realisation(s) each, all "
-            "three colours; the cost above excludes it"
+            "colours; the cost above excludes it"
         )
     if settings.tradeoff:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  in addition, at {where} mm, by collapsed propagation; the cost above excludes it")
-    return "\n".join(lines)
+    told = len(eye_geometry.warnings(values["geometry"]))  # beside the numbers of the geometry, above
+    return "\n".join([*lines, *(f"WARNING    {words}" for words in values["warnings"][told:])])
 
 
 def too_large(values: dict[str, Any]) -> str | None:

@@ -34,7 +34,7 @@ from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.volume.config import VolumeSettings, contradictions
 from holotorch.experiments.volume.run import fingerprint_inputs
 from holotorch.io.bundled import find_config
-from holotorch.io.colour_tables import srgb_matrix, white_balance
+from holotorch.io.colour_tables import picture_matrix
 from holotorch.io.files import save_array, write_bytes
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
@@ -49,7 +49,9 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     scene = load_config(path, list(settings.scene.change))
     if not isinstance(scene, VolumeSettings):
         raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {scene.experiment!r}"])
-    own = {name: value for name in ("volume", "transfer") if (value := getattr(settings, name)) is not None}
+    own = {
+        name: value for name in ("volume", "transfer", "wavelengths") if (value := getattr(settings, name)) is not None
+    }
     scene = scene.model_copy(update=own)
     if problems := contradictions(scene):
         raise ConfigError([f"{'.'.join(map(str, key))}: {words}" for key, words in problems])
@@ -89,7 +91,8 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
         if settings.sweep:
             sweep = eye_focus.focus_sweep(eye, settings.sweep, surface)
             files.write(write_table, folder / "focus.csv", [band.row for band in sweep.bands])
-            files.write(write_bytes, folder / "images" / "focus.png", eye_focus.draw(sweep))
+            drawn = eye_focus.draw(sweep, eye.scene.settings.wavelengths)
+            files.write(write_bytes, folder / "images" / "focus.png", drawn)
             print("\n".join(eye_focus.in_words(sweep)))
         if settings.tradeoff:
             cases = tradeoff(settings, eye.scene.settings, settings.tradeoff)
@@ -122,9 +125,9 @@ class _Views:
     """The pictures computed so far, saved to disk every 30 seconds.
 
     Attributes:
-        total: Sum of the pictures of the reference for each focus, [F, 3, h, w].
+        total: Sum of the pictures of the reference for each focus, [F, C, h, w].
         references: Number of realisations in ``total``.
-        pictures: For each realisation, the pictures of all sources and foci, [sources, F, 3, h, w].
+        pictures: For each realisation, the pictures of all sources and foci, [sources, F, C, h, w].
         checkpoint: The file that stores these pictures.
     """
 
@@ -150,7 +153,7 @@ class _Views:
 
     @property
     def reference(self) -> Tensor:
-        """Mean picture of the reference for each focus, [F, 3, h, w]."""
+        """Mean picture of the reference for each focus, [F, C, h, w]."""
         return self.total / self.references
 
     def compute(self, pressed: list[int]) -> None:
@@ -176,7 +179,7 @@ class _Views:
                 raise KeyboardInterrupt
 
     def _pictures(self, seed: int, sources: Sequence[str | None], bar: tqdm) -> Tensor:
-        """Pictures of a realisation, [sources, F, 3, h, w]."""
+        """Pictures of a realisation, [sources, F, C, h, w]."""
         hologram, _ = self.eye.scene.hologram(self.eye.settings.seed + seed)
         bar.set_postfix(mem=f"{peak_memory() / 1e9:.2f}GB", refresh=False)
         bar.update()
@@ -201,15 +204,13 @@ class _Views:
 
 def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], files: Results) -> dict[str, Any]:
     """Write arrays, pictures and the table. Returns entries of the summary."""
-    reference, images = views.reference, torch.stack(views.pictures)  # [F, 3, h, w], [S, sources, F, 3, h, w]
+    reference, images = views.reference, torch.stack(views.pictures)  # [F, C, h, w], [S, sources, F, C, h, w]
     sources, focus = eye.settings.light.sources, eye.focus
     files.write(save_array, out / "arrays" / "retina.npy", images[0])
     files.write(save_array, out / "arrays" / "reference.npy", reference)
-    # Equal values of the three colours are shown as neutral grey. Each colour has the power of the rendering.
+    # Equal values of all colours are shown as neutral grey. Each colour has the power of the rendering.
     wavelengths = eye.scene.settings.wavelengths
-    matrix = srgb_matrix(wavelengths, white_balance(wavelengths)).float()
-    with torch.no_grad():
-        rendering = eye.scene.sampler().render(eye.scene.volume)[0].cpu()
+    matrix, rendering = picture_matrix(wavelengths).float(), eye.scene.rendering()[0]
     reference = equal_power(reference, rendering.expand_as(reference))
     for f, depth in enumerate(focus):
         shown, captions = [], []

@@ -113,7 +113,7 @@ def _image(eye: Observer, field: Tensor, wavelength: float) -> Tensor:
 
 
 def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor], reference: Tensor) -> Case:
-    """Measurements of holograms [3, H, W] against a reference [h, w]."""
+    """Measurements of holograms [C, H, W] against a reference [h, w]."""
     depth = eye.focus[0]
     wavelengths = wavelength + np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
     weights = np.stack([_weights(wavelengths, Spectrum.lorentzian(wavelength, width)) for width in WIDTHS])

@@ -6,6 +6,7 @@ from typing import Any
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.planning.machine import machine_speed
+from holotorch.experiments.volume.plan import dark_picture
 from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.optics.viewing.pupil_views import View, view_padding
 
@@ -83,12 +84,17 @@ def _left(settings: JointSettings) -> float:
 
 def _notes(experiment: JointExperiment) -> list[str]:
     settings, foci = experiment.settings, experiment.foci
-    notes = []
+    notes = dark_picture(experiment.scene)
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
     if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:
         notes.append(
             f"the planes are {step * 1e3:.3g} mm apart, more than {_SPACING:g} of the depth of focus of "
             f"{focus * 1e3:.3g} mm: images between them may be worse; use more planes or a smaller pupil"
+        )
+    if 0 < (deep := foci[-1] - foci[0]) < focus:
+        notes.append(
+            f"the planes lie within {deep * 1e3:.3g} mm, less than the depth of focus of {focus * 1e3:.3g} mm: every "
+            "focus shows the same picture; use a larger display.depth or a wider pupil"
         )
     if settings.eye.pupil > 0.5:
         notes.append("the pupil is wider than half the band of the pixels, which do not resolve its image fully")

@@ -14,6 +14,9 @@ _PICTURES = {
 }
 
 
+_LITTLE = 0.05  # share of the light in pupil and window below which that is said beside the scores
+
+
 def joint_section(record: RunRecord) -> list[str]:
     """HTML of a run: scores of the methods, pictures, scores by view, and the plan."""
     summary, plan = record.summary, record.plan
@@ -22,6 +25,12 @@ def joint_section(record: RunRecord) -> list[str]:
     if summary["synthetic"]:
         parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
         synthetic = ", synthetic volume"
+    parts += [element("p", note, "warn") for note in plan.get("notes", [])]
+    if (light := summary["methods"].get("joint", {}).get("light_in_pupil", 1.0)) < _LITTLE:
+        words = (
+            f"Warning: only {light:.1%} of the light reaches the pupil and the window; scores do not count the rest."
+        )
+        parts.append(element("p", words, "warn"))
     parts += [element("p", _WORDS), _methods(summary["methods"])]
     parts += [
         figure(source, caption + synthetic, "wide")
@@ -31,8 +40,7 @@ def joint_section(record: RunRecord) -> list[str]:
     if rows := record.rows("views.csv"):
         parts += [element("h2", "Joint correction, view by view"), _views(rows)]
     rows = [[name.replace("_", " "), plain(plan[name])] for name in plan if name != "notes"]
-    parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
-    return parts + [element("p", note, "warn") for note in plan.get("notes", [])]
+    return [*parts, element("h2", "Plan"), table(["", ""], rows, head=False)]
 
 
 _WORDS = (

@@ -143,10 +143,24 @@ def export_text(report: dict[str, Any]) -> str:
         f"{text['picture_change_by_panel']} with the panel's gaps and fringes",
     ]
     if losses := ", ".join(f"{text[name]} by {name}" for name in report.get("encoding_loss", {})):
-        lines.append(f"Encoding   costs {losses} (relative squared error of the picture, no aperture)")
+        lines.append(
+            f"Encoding   costs {losses} (relative squared error of the picture without an aperture; 0 is best)"
+        )
+        lines += _better(report)
     if "content" in report:
         lines.append(f"Content    {report['content']}")
     return "\n".join(lines)
+
+
+def _better(report: dict[str, Any]) -> list[str]:
+    """A line that names the colours in which the kinoform errs less than the encoding of the files, if any."""
+    losses, files = report["encoding_loss"], report["files"]
+    pairs = zip(files, losses[report["encoding"]], losses["kinoform"], strict=False)  # of the first frame
+    better = [Path(file).stem.split("_")[1] for file, loss, other in pairs if other < loss]
+    if not better:
+        return []
+    words = f"--encoding kinoform would be closer at {', '.join(better)}"
+    return [f"Better     {words}; behind an aperture in the Fourier plane double_phase is meant to be"]
 
 
 def _window(hologram: Grid, panel: Grid, name: str) -> tuple:

@@ -96,7 +96,7 @@ def joint_heaters(folder: Path, settings: JointSettings) -> Tensor:
 
 
 def volume_hologram(folder: Path, settings: VolumeSettings) -> Tensor:
-    """Field of a run of kind ``volume``, complex64 [3, H, W]. ValueError if it cannot be read."""
+    """Field of a run of kind ``volume``, complex64 [C, H, W]. ValueError if it cannot be read."""
     height, width = (size // settings.scale for size in settings.hologram.shape)
     shape = (len(settings.wavelengths), height, width)
     hologram = run_array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")

@@ -1,11 +1,22 @@
 """Writing of the pictures of a run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from torch import Tensor
 
+from holotorch.io.colour_tables import picture_matrix
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
+from holotorch.optics.picture import linear_srgb
+
+
+def in_colour(picture: Tensor, wavelengths: Sequence[float]) -> Tensor:
+    """Picture [..., 3, H, W] of channels [..., C, H, W] at C = 1, 2 or 3 wavelengths.
+
+    Three channels are red, green and blue as they are; fewer are shown as by ``colour_tables.picture_matrix``.
+    """
+    return picture if len(wavelengths) == 3 else linear_srgb(picture, picture_matrix(wavelengths))
 
 
 def save_picture(path: Path, picture: Tensor) -> None:

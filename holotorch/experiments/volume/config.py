@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from holotorch.core.quantities import WIDTH
@@ -71,8 +71,11 @@ class TransferSettings(Settings):
     bright part, and the value that 0.1 % of the voxels exceed.
 
     Each point is [value, red, green, blue, opacity]; all but the value are in 0..1. The opacity is that of a path of
-    length ``unit_distance``, in units of the longest side of the volume.
+    length ``unit_distance``, in units of the longest side of the volume. ``transfer: bone`` is short for
+    ``transfer: {preset: bone}``.
     """
+
+    model_config = ConfigDict(json_schema_extra={"type": ["object", "string"]})
 
     preset: Literal["bone", "soft_tissue", "vessels", "industrial"] | None = None
     low: Number | None = None
@@ -80,6 +83,11 @@ class TransferSettings(Settings):
     file: ExistingPath | None = None
     points: tuple[tuple[Number, Number, Number, Number, Number], ...] | None = None
     unit_distance: Annotated[Number, Field(gt=0, le=1)] = 1 / 256
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, value: Any) -> Any:
+        return {"preset": value} if isinstance(value, str) else value
 
 
 class ScatteringSettings(Settings):
@@ -146,7 +154,9 @@ class VolumeSettings(Settings):
     ``phase`` is the phase of the sources: ``point``, random for each source, so that planes do not interfere on
     average; ``ray``, random for each ray, as in the thesis, so that the planes of a colour interfere; ``smooth``, a
     smooth random function of the ray; or ``constant``. ``scale`` divides pixels, rays, distances, the volume's width
-    and a given number of planes, which makes a small version of a scene. ``tolerance``: allowed relative L2 error of
+    and a given number of planes, which makes a small version of a scene. Three wavelengths show red, green and blue of
+    the volume; a single one shows their mean; of two, the longer one shows the mean of red and green, the shorter one
+    that of green and blue. ``tolerance``: allowed relative L2 error of
     the refocused fields, divided between the hologram and its refocusing; without it they err by 1e-3 and 3e-3.
     """
 
@@ -183,8 +193,9 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     if isinstance(hologram.depths, tuple) and len(set(hologram.depths)) < len(hologram.depths):
         twice = next(depth for k, depth in enumerate(hologram.depths) if depth in hologram.depths[:k])
         problems.append((("hologram", "depths"), f"expected distances that all differ, got {twice:g} m twice"))
-    if len(settings.wavelengths) != 3:
-        problems.append((("wavelengths",), f"expected 3 (red, green, blue), got {len(settings.wavelengths)}"))
+    if (count := len(settings.wavelengths)) not in (1, 2, 3):
+        words = "expected 1 (grey), 2 or 3 (red, green, blue), since a volume has three colours to share among them"
+        problems.append((("wavelengths",), f"{words}, got {count}"))
     side, rays = hologram.shape, hologram.rays
     if rays is not None and (side[0] % rays or side[1] % rays or side[0] // rays != side[1] // rays):
         message = f"expected a number that divides the hologram's sides {side}, got {rays}"

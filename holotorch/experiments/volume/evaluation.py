@@ -23,27 +23,26 @@ class VolumeEvaluation:
 
     Attributes:
         depths: Depths in metres at which the hologram is refocused.
-        rendering: Direct volume rendering along the rays, red, green, blue [3, h, w].
+        rendering: Direct volume rendering along the rays, a channel for each wavelength, [C, h, w].
         opacity: Opacity of each ray, [h, w].
         depth: Mean depth of the light of each ray, in metres, [h, w].
         visible: Whether each ray shows part of the volume, bool [h, w].
-        sums: Sum of refocused intensities over realisations, averaged over the pixels of each ray, [F, 3, h, w].
+        sums: Sum of refocused intensities over realisations, averaged over the pixels of each ray, [F, C, h, w].
         count: Number of realisations in ``sums``.
     """
 
     def __init__(self, experiment: VolumeExperiment):
         self.experiment = experiment
-        sampler = experiment.sampler()
+        self.rendering, self.opacity = experiment.rendering()
         with torch.no_grad():
-            self.rendering, self.opacity = (each.cpu() for each in sampler.render(experiment.volume))
-            self.depth = sampler.depth_map(experiment.volume).cpu()
+            self.depth = experiment.sampler().depth_map(experiment.volume).cpu()
         self.visible = self.opacity > VISIBLE
         self.depths = experiment.refocus or self._quantiles()
         self.sums = torch.zeros(len(self.depths), *self.rendering.shape)
         self.count = 0
 
     def add(self, hologram: Tensor) -> None:
-        """Refocus the hologram [3, H, W] of another realisation and add its pictures to the sums."""
+        """Refocus the hologram [C, H, W] of another realisation and add its pictures to the sums."""
         experiment, stride = self.experiment, self.experiment.stride
         tolerance = experiment.budget.share(REFOCUSING)
         for f, depth in enumerate(self.depths):
@@ -55,12 +54,12 @@ class VolumeEvaluation:
 
     @property
     def pictures(self) -> Tensor:
-        """Mean refocused pictures [F, 3, h, w], with each colour scaled to fit the rendering best."""
+        """Mean refocused pictures [F, C, h, w], with each colour scaled to fit the rendering best."""
         mean = self.sums / max(1, self.count)
         return mean * best_scale(self.sharpest(mean), self.rendering)[:, None, None]
 
     def sharpest(self, pictures: Tensor) -> Tensor:
-        """Picture [3, h, w] that takes each ray from the one of ``pictures`` refocused nearest to the ray's depth."""
+        """Picture [C, h, w] that takes each ray from the one of ``pictures`` refocused nearest to the ray's depth."""
         return pictures.gather(0, self._nearest().expand(1, *pictures.shape[1:]))[0]
 
     def numbers(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ from holotorch.experiments.runs.environment import find_device
 from holotorch.experiments.volume.config import TransferSettings, VolumeSettings, VolumeSource
 from holotorch.hologram import AxialHologram, ConvolutionHologram, HologramPlan, plan_hologram
 from holotorch.io.catalogue import PUBLISHED, fetch_volume
+from holotorch.io.colour_tables import picture_matrix
 from holotorch.io.files import read_bytes
 from holotorch.io.volumes import load_volume
 from holotorch.optics import plan_propagation
@@ -36,6 +37,8 @@ _COUNTED = 1_000_000  # voxels of the histogram at most
 HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the tolerance of a run
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
+# Shares of red, green and blue that each wavelength shows, longest first, for fewer wavelengths than colours.
+_SHOWN = {1: ((1 / 3, 1 / 3, 1 / 3),), 2: ((0.5, 0.5, 0.0), (0.0, 0.5, 0.5))}
 
 
 @dataclass(frozen=True)
@@ -141,8 +144,9 @@ class VolumeExperiment:
 
     @cached_property
     def transfer(self) -> TransferFunction:
-        """Transfer function from a value of the volume to colour and opacity."""
-        return _transfer(self.settings.transfer, self.preset_range).to(self.device)
+        """Transfer function from a value of the volume to opacity and the colours that the wavelengths show."""
+        transfer = _transfer(self.settings.transfer, self.preset_range)
+        return _shared(transfer, self.settings.wavelengths).to(self.device)
 
     @cached_property
     def preset_range(self) -> tuple[float, float] | None:
@@ -181,6 +185,30 @@ class VolumeExperiment:
         sampler.checks_slabs = False  # the plan tells the error
         return sampler
 
+    def rendering(self) -> tuple[Tensor, Tensor]:
+        """Direct volume rendering [C, h, w], a channel for each wavelength, and the opacity of the rays [h, w]."""
+        with torch.no_grad():
+            picture, opacity = self.sampler().render(self.volume)
+        return picture[: len(self.settings.wavelengths)].cpu(), opacity.cpu()
+
+    def quick_rendering(self, side: int, *, lit: bool = True) -> Tensor:
+        """The same picture on at most ``side`` rays along each side, without lighting and scattering unless ``lit``."""
+        rays = self.rays
+        step = max(1, -(-max(rays.shape) // side))
+        height, width = (max(1, n // step) for n in rays.shape)
+        sampler = DVRSampler(
+            self.transfer,
+            Grid((height, width), (rays.pitch[0] * step, rays.pitch[1] * step)),
+            self.depths,
+            width=self.width,
+            distance=self.distance,
+            rotation=self.rotation,
+            lighting=self._lighting() if lit else None,
+        )
+        sampler.checks_slabs = False  # the plan tells the error
+        with torch.no_grad():
+            return sampler.render(self.volume)[0][: len(self.settings.wavelengths)].cpu()
+
     def _lighting(self) -> Lighting | Scattering | None:
         if (light := self.settings.view.scattering) is not None:
             strengths = {name: getattr(light, name) for name in ("ambient", "strength", "anisotropy", "samples")}
@@ -197,7 +225,7 @@ class VolumeExperiment:
     def hologram(
         self, seed: int = 0, advance: Callable[[], object] = lambda: None, part: "Part | None" = None
     ) -> tuple[Tensor, float]:
-        """Fields [3, H, W] of the holograms of one realisation, and the seconds spent on rendering.
+        """Fields [C, H, W] of the holograms of one realisation, and the seconds spent on rendering.
 
         Each plane is rendered once and added to all colours. ``seed`` is the number of the realisation of the phases;
         ``advance`` is called after every plane; ``part`` selects planes and colours, all by default.
@@ -233,18 +261,20 @@ class VolumeExperiment:
 
 @dataclass(frozen=True)
 class Part:
-    """The share of one of several processes: the processes divide the three colours, then the planes of a colour."""
+    """The share of one of several processes: the processes divide the colours, then the planes of a colour."""
 
     rank: int  # index of this process
     count: int  # number of processes
     planes: int  # number of planes in the scene
+    colours: int = 3  # number of wavelengths
 
     def takes(self, colour: int, plane: int) -> bool:
         """Whether this process adds ``plane`` of ``colour``."""
-        if self.count <= 3:
+        every = self.colours
+        if self.count <= every:
             return colour % self.count == self.rank
-        blocks = (self.count - colour + 2) // 3  # number of processes whose rank modulo 3 is this colour
-        return self.rank % 3 == colour and plane * blocks // self.planes == self.rank // 3
+        blocks = (self.count - colour + every - 1) // every  # number of processes whose rank modulo C is this colour
+        return self.rank % every == colour and plane * blocks // self.planes == self.rank // every
 
 
 def build(settings: VolumeSettings) -> VolumeExperiment:
@@ -258,6 +288,11 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
         raise ConfigError([f"volume: {error}"]) from error
     except OSError as error:
         raise ConfigError([f"transfer.file: {error.filename}: {error.strerror}"]) from error
+    try:
+        if len(settings.wavelengths) == 2:
+            picture_matrix(settings.wavelengths)
+    except ValueError as error:
+        raise ConfigError([f"wavelengths: {error}; two wavelengths are shown in their own colours"]) from error
     if (nearest := min(experiment.depths)) <= 0:
         raise ConfigError([f"hologram.distance: the volume extends behind the hologram, to {nearest:g} m"])
     return experiment
@@ -288,6 +323,22 @@ def open_volume(source: VolumeSource) -> tuple[Volume, str]:
             raise ConfigError([f"volume.scene: {reason}, or volume.phantom to stand in for it"])
     assert source.phantom is not None
     return getattr(phantoms, source.phantom)(source.samples, dtype=torch.uint8), reason
+
+
+def _shared(transfer: TransferFunction, wavelengths: Sequence[float]) -> TransferFunction:
+    """The transfer function with a channel for each wavelength in place of red, green and blue, and copies after it.
+
+    Compositing is linear in the colours, so that mixing them here mixes those of the rendering.
+    """
+    if (shares := _SHOWN.get(len(wavelengths))) is None:
+        return transfer
+    longest_first = sorted(wavelengths, reverse=True)
+    rows = [shares[longest_first.index(wavelength)] for wavelength in wavelengths]
+    rows += rows[-1:] * (3 - len(rows))
+    colours = transfer.colours.detach()
+    mixed = (colours @ torch.tensor(rows, dtype=colours.dtype).T).clamp(0, 1)
+    opacities = transfer.opacities.detach()
+    return TransferFunction(transfer.positions, mixed, opacities, unit_distance=transfer.unit_distance)
 
 
 def _transfer(settings: TransferSettings, preset_range: tuple[float, float] | None) -> TransferFunction:

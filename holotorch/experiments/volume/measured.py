@@ -60,11 +60,13 @@ def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Compar
 
 
 def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: float, limit: float = LIMIT) -> Comparison:
-    """Error of refocusing the middle colour of ``hologram`` [3, H, W] at a depth in metres.
+    """Error of refocusing the middle colour of ``hologram`` [C, H, W] at a depth in metres.
 
     The reference is propagated in complex128 within the smallest tolerance that some method reaches.
     """
-    wavelength, tolerance = experiment.settings.wavelengths[1], experiment.budget.share(REFOCUSING)
+    wavelengths, tolerance = experiment.settings.wavelengths, experiment.budget.share(REFOCUSING)
+    middle = len(wavelengths) // 2
+    wavelength = wavelengths[middle]
     scene = experiment.grid, wavelength, -depth
     predicted = plan_propagation(*scene, tolerance=tolerance, dtype=experiment.dtype).predicted_error
     plan = plan_propagation(*scene, tolerance=_TIGHT, dtype=torch.complex128)
@@ -77,8 +79,8 @@ def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: floa
         return not_measured(REFOCUSING, predicted, seconds * speed)
     setup = experiment.grid, wavelength, depth
     with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the note states the error
-        exact = refocused(hologram[1].to(torch.complex128), *setup, tolerance=_TIGHT)
-    error = relative_error(refocused(hologram[1].to(experiment.dtype), *setup, tolerance=tolerance), exact)
+        exact = refocused(hologram[middle].to(torch.complex128), *setup, tolerance=_TIGHT)
+    error = relative_error(refocused(hologram[middle].to(experiment.dtype), *setup, tolerance=tolerance), exact)
     words = f"{wavelength * 1e9:.0f} nm at {depth * 1e3:.4g} mm, against complex128 within {plan.predicted_error:.0e}"
     return Comparison(REFOCUSING, predicted, error, words)
 

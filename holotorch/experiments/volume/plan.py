@@ -1,6 +1,7 @@
 """The plan of a volume's run: methods, cost and physics, before anything is computed."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -22,7 +23,11 @@ _BASE_BYTES = 500e6  # memory of the libraries
 _RAY_BYTES = 120  # memory of the renderer per ray
 _COARSE_SLABS = 0.1  # predicted error of a rendering that is noted
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
-_COARSE = 64  # rays along each side of the rendering that estimates how much light is cut off
+_COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
+_LIT, _DARK = (
+    0.05,
+    0.1,
+)  # value from which a ray is not black, and share of such rays below which a picture is mostly so
 
 
 def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
@@ -70,6 +75,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
         "predicted_peak_bytes": round(peak),
         "device": str(experiment.device),
         "physics": _physics(experiment),
+        "warnings": [*_shallow(experiment), *dark_picture(experiment)],
         "notes": _notes(experiment, slab_error),
     }
 
@@ -117,6 +123,7 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     if settings.scale > 1:
         divided = "pixels, rays, distances, width and a given number of planes"
         lines.append(f"Scale      1 / {settings.scale} of the configuration: {divided} are divided by {settings.scale}")
+    lines += colours_in_words(settings.wavelengths)
     for each in values["holograms"]:
         method = each["method"] + (f", {each['cone']} cone of light" if each["near"] else "")
         error = f"predicted error {each['predicted_error']:.1e}"
@@ -129,7 +136,19 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     lines += [f"Note       {note}" for note in values["notes"]]
+    lines += [f"WARNING    {words}" for words in values["warnings"]]
     return "\n".join(lines)
+
+
+def colours_in_words(wavelengths: Sequence[float]) -> list[str]:
+    """What each wavelength shows of the colours of the volume, as a line of a plan; none for three wavelengths."""
+    if len(wavelengths) == 3:
+        return []
+    names = [f"{wavelength * 1e9:.0f} nm" for wavelength in sorted(wavelengths, reverse=True)]
+    if len(names) == 1:
+        return [f"Colours    {names[0]} shows the mean of the volume's red, green and blue; pictures of it are grey"]
+    shown = f"{names[0]} shows the mean of the volume's red and green, {names[1]} that of green and blue"
+    return [f"Colours    {shown}; pictures show both in their own colours"]
 
 
 def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
@@ -170,16 +189,31 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     lost = _lost_light(experiment)
     if lost > 0.005:
         notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
+    return notes
+
+
+def _shallow(experiment: VolumeExperiment) -> list[str]:
     nearest, depth = min(experiment.depths), max(experiment.depths) - min(experiment.depths)
     half_angle = math.atan(min(experiment.grid.extent) / 2 / nearest)
     wavelength = min(experiment.settings.wavelengths)
     aperture = min(math.sin(half_angle), wavelength / (2 * max(experiment.rays.pitch)))
     if 0 < depth < (focus := depth_of_focus(wavelength, aperture)):
-        notes.append(
+        return [
             f"the scene is {depth * 1e3:.3g} mm deep and the depth of focus {focus * 1e3:.3g} mm: refocusing "
             "makes no visible difference; use a deeper scene, a smaller distance, or a wider hologram with finer rays"
-        )
-    return notes
+        ]
+    return []
+
+
+def dark_picture(experiment: VolumeExperiment) -> list[str]:
+    """A warning if most of the rendering is black, from a coarse one; otherwise none."""
+    share = (experiment.quick_rendering(_COARSE, lit=False).amax(0) > _LIT).double().mean().item()
+    if share >= _DARK:
+        return []
+    return [
+        f"{100 * (1 - share):.0f} % of the picture is black: SSIM, which compares black with black there, says little; "
+        "look at holotorch check --preview, and change transfer or view.width"
+    ]
 
 
 def _lost_light(experiment: VolumeExperiment) -> float:

@@ -28,10 +28,13 @@ def volume_section(record: RunRecord) -> list[str]:
     parts.append("</div>")
     if source := record.picture("depth"):
         parts.append(figure(source, "Mean depth along each ray", "wide"))
+    parts += [element("p", f"Warning: {words}.", "warn") for words in plan.get("warnings", [])]
     parts += [_scores(summary, depths), element("p", _cost(summary))]
     if words := error_sentence(summary):
         parts.append(element("p", words))
-    rows = [[name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "holograms")]
+    rows = [
+        [name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "warnings", "holograms")
+    ]
     rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
     parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
     return parts + [element("p", note, "warn") for note in plan["notes"]]

@@ -16,7 +16,7 @@ from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
-from holotorch.experiments.runs.pictures import save_picture
+from holotorch.experiments.runs.pictures import in_colour, save_picture
 from holotorch.experiments.runs.processes import process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import Pressed, deferred
@@ -36,7 +36,7 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
     start, part = torch.tensor(state.evaluation.count if state else 0), None
     if count > 1:
         torch.distributed.broadcast(start, 0)  # all processes go on where the first process stopped
-        part = Part(rank, count, planes)
+        part = Part(rank, count, planes, len(experiment.settings.wavelengths))
     start = int(start)
     total, done = planes * seeds, planes * start
     with tqdm(total=total, initial=done, desc="rendering", unit="plane", disable=not state, dynamic_ncols=True) as bar:
@@ -150,6 +150,7 @@ def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, error
     files.write(write_json, out / "layers.json", layers | {"sign": "exp(+ikr) / r"})
     images = {"rendering": evaluation.rendering, "in_focus": evaluation.sharpest(pictures)}
     images |= {f"focus_{f}": picture for f, picture in enumerate(pictures)}
+    images = {name: in_colour(picture, experiment.settings.wavelengths) for name, picture in images.items()}
     for name, picture in images.items():
         files.write(save_picture, out / "images" / name, picture)
     captions = ["Direct volume rendering", "Hologram, every ray at its depth"]

@@ -132,6 +132,21 @@ def test_the_plan_says_how_the_scene_is_seen():
     assert main(["check", str(CONFIG), *SMALL]) == 0
 
 
+def test_what_spoils_the_pictures_is_said_before_they_are_computed():
+    def warnings(*changes: str) -> list[str]:
+        eye = observer(wanted := settings(*changes), scene_settings(wanted))
+        values = plan_values(eye)
+        assert all(f"WARNING    {words}" in plan_text(eye, values) for words in values["warnings"])
+        return [words.partition(":")[0] for words in values["warnings"]]
+
+    near = SCENE.replace("distance: 12 mm", "distance: 3 mm"), "focus=[3 mm]"
+    assert warnings(*near) == []
+    (flat,) = warnings()
+    assert flat.startswith("the scene is ") and "this eye's depth of focus" in flat
+    (dark,) = warnings(*near, "transfer={points: [[220, 1, 1, 1, 0], [255, 1, 1, 1, 1]]}")
+    assert dark.endswith("% of the picture is black")
+
+
 def test_a_check_does_not_load_the_template_engine():
     code = "import sys; from holotorch.cli import main; assert not main(sys.argv[1:]) and 'jinja2' not in sys.modules"
     subprocess.run([sys.executable, "-c", code, "check", str(CONFIG), *SMALL], check=True, stdout=subprocess.DEVNULL)
@@ -140,7 +155,7 @@ def test_a_check_does_not_load_the_template_engine():
 def test_the_plan_names_what_it_does_not_count(capsys):
     words = [*TINY, "eye.tolerance=0.1", "tradeoff=[2 mm, 3 mm]", "sweep={steps: 5, realisations: 2}"]
     assert main(["check", str(CONFIG), *words]) == 0
-    lines = capsys.readouterr().out.splitlines()[-2:]
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(("Sweep", "Trade-off"))]
     assert lines[0].startswith("Sweep      in addition, 5 depths of focus, 2 realisation(s) each")
     assert lines[1] == "Trade-off  in addition, at 2, 3 mm, by collapsed propagation; the cost above excludes it"
 

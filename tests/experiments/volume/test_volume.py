@@ -220,7 +220,7 @@ def test_an_empty_volume_is_black(tmp_path):
         ("volume={scene: tooht}", "did you mean 'tooth'"),
         ("transfer={preset: bone, low: 9, high: 3}", "transfer: a preset needs low < high"),
         ("transfer={}", "transfer: expected one of preset, file or points"),
-        ("wavelengths=[520 nm]", "wavelengths: expected 3"),
+        ("wavelengths=[450 nm, 500 nm, 550 nm, 600 nm]", "wavelengths: expected 1 .grey., 2 or 3"),
         ("view={lighting: true, scattering: {}}", "view.lighting: expected false with scattering"),
         ("view.scattering={towards: [0, 0, 0]}", "view.scattering: expected towards to point to the light"),
         ("scale=3", "scale: expected a divisor of the pixels"),
@@ -265,10 +265,10 @@ def test_light_beside_the_rays_is_said(tmp_path):
 def test_a_scene_within_the_depth_of_focus_is_noted():
     """The rays' pitch of 7.48 um limits the sine to 0.0304 for 455 nm: a depth of focus of 0.49 mm."""
     shallow = settings("hologram.depths=[2.9 mm, 3.1 mm]", "wavelengths=[636 nm, 520 nm, 455 nm]")
-    (note,) = (note for note in plan_values(build(shallow))["notes"] if "depth of focus" in note)
+    (note,) = (note for note in plan_values(build(shallow))["warnings"] if "depth of focus" in note)
     assert note.startswith("the scene is 0.2 mm deep and the depth of focus 0.49") and "wider hologram" in note
     deep = settings("hologram.depths=[2 mm, 4 mm]")
-    assert not any("depth of focus" in note for note in plan_values(build(deep))["notes"])
+    assert not any("depth of focus" in note for note in plan_values(build(deep))["warnings"])
 
 
 def test_cells_around_rays_do_not_wrap():

@@ -17,7 +17,7 @@ from holotorch.experiments.panel.source import run_array
 from holotorch.experiments.view.controls import Choice, Slider, span
 from holotorch.experiments.view.kinds.turning import turned, turning_controls
 from holotorch.experiments.view.viewer import Picture, Shown, Viewer, percent
-from holotorch.io.colour_tables import srgb_matrix, white_balance
+from holotorch.io.colour_tables import picture_matrix
 from holotorch.metrics import speckle_contrast, ssim
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 from holotorch.optics.viewing.imaging import CollapseSampling
@@ -35,10 +35,10 @@ class EyeViewer(Viewer):
         scene, settings = experiment.scene, experiment.settings
         self.title = "What an observer sees" + (" (synthetic)" if scene.synthetic else "")
         self._experiment, focus = experiment, experiment.focus
-        shape = (len(focus), 3, *scene.rays.shape)
-        self._reference = run_array(folder / "arrays" / "reference.npy", shape, "(F, C, h, w)", "float32")
         wavelengths = scene.settings.wavelengths
-        self._matrix = srgb_matrix(wavelengths, white_balance(wavelengths)).float()
+        shape = (len(focus), len(wavelengths), *scene.rays.shape)
+        self._reference = run_array(folder / "arrays" / "reference.npy", shape, "(F, C, h, w)", "float32")
+        self._matrix = picture_matrix(wavelengths).float()
         # Orientation and realisation, and their hologram.
         self._hologram: tuple[Any, Tensor] = None, self._reference
         self._rendering = lru_cache(2)(self._render)
@@ -46,7 +46,7 @@ class EyeViewer(Viewer):
         self.controls = self._controls()
         start = self._observer(1e3 * settings.eye.pupil_radius).retina(focus[len(focus) // 2]).sampling
         padded = max(start.padded, start.fine) if isinstance(start, CollapseSampling) else scene.grid.shape
-        self.transforms = 3, *padded
+        self.transforms = len(wavelengths), *padded
         self.note = (
             "The hologram is computed from the volume when it is first needed, and seen by one wavelength a colour "
             "while a control moves; while the volume turns, its rendering follows. Each colour has the power of the "
@@ -110,7 +110,7 @@ class EyeViewer(Viewer):
 
     def _render(self, azimuth: float, elevation: float) -> Tensor:
         scene = turned(self._experiment.scene, azimuth, elevation)
-        return scene.sampler().render(scene.volume)[0].cpu()
+        return scene.rendering()[0]
 
     def _with_pupil(self, radius: float) -> Observer:
         """The observer with a pupil of another radius, in millimetres."""

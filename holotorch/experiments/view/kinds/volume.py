@@ -12,6 +12,7 @@ from torch import Tensor
 from holotorch.core.grid import Grid
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.panel.source import run_array, volume_hologram
+from holotorch.experiments.runs.pictures import in_colour
 from holotorch.experiments.view.controls import Choice, Slider, span
 from holotorch.experiments.view.kinds.pupil import view_controls, view_of
 from holotorch.experiments.view.kinds.refocus import Refocuser
@@ -31,7 +32,7 @@ class Scene:
 
     Attributes:
         refocusers: Its colours, one by one.
-        rendering: Red, green and blue [3, h, w].
+        rendering: A channel for each wavelength, [C, h, w].
         stride: Pixels of the hologram for each ray of the rendering.
         scale: Factor by which all lengths are smaller than those of the run.
     """
@@ -52,14 +53,18 @@ class VolumeViewer(Viewer):
         half = experiment.width * float(extent.norm() / extent.max()) / 2  # of the volume in any direction
         middle, ends = experiment.distance, (min(experiment.depths), max(experiment.depths))
         self._foci = min(max(middle / 10, middle - half), ends[0]), max(middle + half, ends[1])
-        rendering = run_array(folder / "arrays" / "rendering.npy", (3, *experiment.rays.shape), "(C, h, w)", "float32")
+        wavelengths = experiment.settings.wavelengths
+        shape = (len(wavelengths), *experiment.rays.shape)
+        rendering = run_array(folder / "arrays" / "rendering.npy", shape, "(C, h, w)", "float32")
         self._stored = self._scene(volume_hologram(folder, experiment.settings), rendering, experiment, 1)
-        self.transforms = 3, *self._stored.refocusers[0].padded.shape
+        self.transforms = len(wavelengths), *self._stored.refocusers[0].padded.shape
         self._turned: dict[int, tuple[tuple[float, float], Scene]] = {}  # the last orientation by the divisor
-        names = {f"{c}": f"{w * 1e9:.0f} nm only" for c, w in enumerate(experiment.settings.wavelengths)}
+        every = {1: f"{wavelengths[0] * 1e9:.0f} nm", 2: "both", 3: "all three"}[len(wavelengths)]
+        several = enumerate(wavelengths) if len(wavelengths) > 1 else ()
+        names = {f"{c}": f"{w * 1e9:.0f} nm only" for c, w in several}
         self.controls = [
-            *view_controls(experiment.grid, experiment.settings.wavelengths, self._foci, middle),
-            Choice("colour", "Colours", {"all": "all three"} | names, "all", "The lasers that are on."),
+            *view_controls(experiment.grid, wavelengths, self._foci, middle),
+            Choice("colour", "Colours", {"all": every} | names, "all", "The lasers that are on."),
             Slider(
                 "shift", "Wavelength off by", "nm", **span(-_SHIFT, _SHIFT, 0.0, 80),
                 explanation="The same hologram in light of another wavelength is in focus at another depth.",
@@ -75,8 +80,9 @@ class VolumeViewer(Viewer):
     def show(self, values: Mapping[str, Any], coarse: bool, proceed: Callable[[], None]) -> Shown:
         """See :class:`Viewer`."""
         scene, reduced = self._scene_at((values["azimuth"], values["elevation"]), coarse, proceed)
-        colours = range(3) if values["colour"] == "all" else [int(values["colour"])]
-        wavelengths, rendering = self._experiment.settings.wavelengths, scene.rendering[list(colours)]
+        wavelengths = self._experiment.settings.wavelengths
+        colours = range(len(wavelengths)) if values["colour"] == "all" else [int(values["colour"])]
+        rendering, on = scene.rendering[list(colours)], [wavelengths[c] for c in colours]
         seen = view_of(values, scene.scale)
         images, shares = [], []
         for c in colours:
@@ -89,8 +95,9 @@ class VolumeViewer(Viewer):
             "light in the pupil": percent(sum(shares) / len(shares)),
             "hologram": "{} x {} px".format(*scene.refocusers[0].grid.shape),
         }
-        shown = Picture.of("shown", f"Hologram in focus at {values['focus']:.4g} mm", picture)
-        pictures = [shown, Picture.of("rendering", "Direct volume rendering", rendering)]
+        caption = f"Hologram in focus at {values['focus']:.4g} mm"
+        shown = Picture.of("shown", caption, in_colour(picture, on))
+        pictures = [shown, Picture.of("rendering", "Direct volume rendering", in_colour(rendering, on))]
         return Shown(pictures, numbers, reduced)
 
     def _scene_at(self, angles: tuple[float, float], coarse: bool, proceed: Callable[[], None]) -> tuple[Scene, bool]:
@@ -104,8 +111,7 @@ class VolumeViewer(Viewer):
         if divisor not in self._turned or self._turned[divisor][0] != angles:
             self._turned.pop(divisor, None)  # its memory is needed
             experiment = turned(self._experiment, *angles, divisor)
-            with torch.no_grad():
-                rendering = experiment.sampler().render(experiment.volume)[0].cpu()
+            rendering = experiment.rendering()[0]
             hologram, _ = experiment.hologram(advance=proceed)
             self._turned[divisor] = angles, self._scene(hologram, rendering, experiment, divisor)
         return self._turned[divisor][1], divisor > fine

@@ -1,0 +1,91 @@
+"""Holograms of volumes, and what an eye sees of them, at one and at two wavelengths."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from paths import CONFIGS
+from PIL import Image
+
+from holotorch.cli import main
+from holotorch.experiments.view.controls import checked
+from holotorch.experiments.view.opening import open_viewer
+from holotorch.io.colour_tables import picture_matrix
+
+TINY = [
+    "volume={phantom: shells, samples: 24}",
+    "transfer={points: [[20, 1, 0.2, 0, 0], [120, 1, 0.6, 0.2, 0.3], [255, 0.2, 0.9, 1, 0.9]], unit_distance: 0.05}",
+    "hologram={shape: [64, 64], pitch: 3.74 um, distance: 3 mm, depths: 12, rays: 32}",
+    "device=cpu",
+]
+SHARES = {
+    "520 nm": [[1 / 3, 1 / 3, 1 / 3]],
+    "636 nm, 455 nm": [[0.5, 0.5, 0], [0, 0.5, 0.5]],
+    "455 nm, 636 nm": [[0, 0.5, 0.5], [0.5, 0.5, 0]],
+}
+
+
+@pytest.fixture(scope="module")
+def in_three(tmp_path_factory):
+    out = tmp_path_factory.mktemp("volume") / "run"
+    assert main(["run", str(CONFIGS / "volume" / "tooth.yaml"), *TINY, "phase=constant", "--out", str(out)]) == 0
+    return np.load(out / "arrays" / "rendering.npy")
+
+
+@pytest.mark.parametrize("wavelengths", SHARES)
+def test_each_wavelength_shows_its_share_of_the_colours(wavelengths, in_three, tmp_path, capsys):
+    out, words = tmp_path / "run", [*TINY, "phase=constant", f"wavelengths=[{wavelengths}]"]
+    assert main(["run", str(CONFIGS / "volume" / "tooth.yaml"), *words, "--out", str(out)]) == 0
+    assert "Colours    " in capsys.readouterr().out
+    shares = np.array(SHARES[wavelengths])
+    hologram, rendering = (np.load(out / "arrays" / f"{name}.npy") for name in ("hologram", "rendering"))
+    assert hologram.shape == (len(shares), 64, 64)
+    # Opacity does not depend on the colour, so that the light of a ray is linear in it.
+    assert np.abs(rendering - np.einsum("ck,khw->chw", shares, in_three)).max() < 1e-5
+    assert json.loads((out / "summary.json").read_text())["ssim_in_focus"] > 0
+    with Image.open(out / "images" / "rendering.png") as picture:
+        grey = np.asarray(picture.convert("RGB")).astype(int)
+    assert (np.ptp(grey, -1).max() == 0) == (len(shares) == 1)
+    viewer = open_viewer(out)
+    with torch.no_grad():
+        shown = viewer.show(checked(viewer.controls, {}), False, lambda: None)
+    assert len(shown.pictures) == 2
+    panel = [
+        "--slm",
+        str(CONFIGS / "slm" / "lcos_1080p.yaml"),
+        "shape=64",
+        "pitch=3.74 um",
+        "--out",
+        str(tmp_path / "slm"),
+    ]
+    assert main(["export-slm", str(out), *panel]) == 0
+    assert len(list((tmp_path / "slm").glob("*.png"))) == len(shares)
+
+
+@pytest.mark.parametrize("wavelengths", ["520 nm", "636 nm, 455 nm"])
+def test_an_eye_sees_few_wavelengths(wavelengths, tmp_path):
+    change = "'volume={phantom: c60, samples: 24}', "
+    change += "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 12 mm, depths: 8, rays: 32}'"
+    words = [f"scene={{config: configs/volume/c60.yaml, change: [{change}]}}", "seeds=1"]
+    words += ["light={sources: [laser, sled]}", "focus=[12 mm]", "tolerance=0.3", f"wavelengths=[{wavelengths}]"]
+    out = tmp_path / "run"
+    assert main(["run", str(CONFIGS / "eye" / "teapot.yaml"), *words, "--out", str(out)]) == 0
+    count = len(SHARES[wavelengths])
+    assert np.load(out / "arrays" / "retina.npy").shape == (2, 1, count, 32, 32)
+    summary = json.loads((out / "summary.json").read_text())
+    assert all(len(row["contrast"]) == count for row in summary["rows"])
+    viewer = open_viewer(out)
+    with torch.no_grad():
+        assert viewer.show(checked(viewer.controls, {}), True, lambda: None).pictures
+
+
+def test_two_wavelengths_are_shown_in_their_own_colours_and_one_in_grey():
+    red, blue = picture_matrix([636e-9, 455e-9]).T
+    assert red.argmax() == 0 and blue.argmax() == 2 and min(red.min(), blue.min()) >= 0
+    assert (picture_matrix([520e-9]) == 1).all()
+    torch.testing.assert_close(
+        picture_matrix([636e-9, 520e-9, 455e-9]).sum(1), torch.ones(3, dtype=torch.float64), atol=1e-3, rtol=0
+    )
+    with pytest.raises(ValueError, match="expected 1, 2 or 3 wavelengths, got 4"):
+        picture_matrix([4e-7, 5e-7, 6e-7, 7e-7])
