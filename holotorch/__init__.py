@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holotorch.scene import DVRSampler, Volume
     from holotorch.tracking import CatheterTracker
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "APG",
     "AxialHologram",

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,14 @@ def test_the_names_that_most_scripts_begin_with_are_at_the_top():
     assert holotorch.propagate is propagate and holotorch.CatheterTracker is CatheterTracker
     assert all(getattr(holotorch, name) for name in holotorch.__all__)
     assert set(holotorch.__all__) <= set(dir(holotorch))
+
+
+def test_every_dependency_has_its_licence_in_the_guide():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [each for needs in project["optional-dependencies"].values() for each in needs]
+    names = {re.split(r"[<>=~!;\[ ]", each)[0] for each in [*project["dependencies"], *extras]}
+    text = (ROOT / "scripts" / "docs" / "changes.md").read_text().partition("## Licences")[2]
+    assert sorted(name for name in names if not re.search(rf"[ ]{re.escape(name)}[ ,:;]", text)) == []
 
 
 GUIDE = sorted((ROOT / "scripts" / "docs").rglob("*.md"))
