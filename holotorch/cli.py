@@ -40,6 +40,9 @@ def main(arguments: list[str] | None = None) -> int:
         explanation = str(error) if isinstance(error, MemoryError) else ""
         print(explanation or "out of memory; use a smaller grid", file=sys.stderr)
         return FAILED
+    except ConnectionError as error:
+        print(error, file=sys.stderr)
+        return FAILED
     except OSError as error:
         print(f"{error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
         return BAD_INPUT if error.errno == errno.ENAMETOOLONG else FAILED

@@ -1,7 +1,7 @@
 """Observer: the hologram of a volume under light of a real spectrum, seen by a focused eye through a display."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -180,14 +180,20 @@ class Observer:
                 raise ConfigError([f"display: {error}"]) from error
         return self._retina_plans[depth]
 
-    def image(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
+    def image(
+        self, hologram: Tensor, source: str | None, depth: float, colours: Collection[int] | None = None
+    ) -> Tensor:
         """Intensity on the retina of an eye focused at a depth (metres), averaged around each scene ray, [C, h, w].
 
-        ``hologram`` is complex [C, H, W]. Without a source, each colour has a single wavelength.
+        ``hologram`` is complex [C, H, W]. Without a source, each colour has a single wavelength. Colours that are not
+        in ``colours`` are not computed, and are zero.
         """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
         elements = self.retina(depth).method == "elements"
-        for light, wavelength in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
+        for c, (light, wavelength) in enumerate(zip(hologram.conj(), self.scene.settings.wavelengths, strict=True)):
+            if colours is not None and c not in colours:
+                pictures.append(torch.zeros(self.scene.rays.shape))
+                continue
             samples, points = ([wavelength], [1.0], 1), ([(0.0, 0.0)], [1.0])
             if source is not None:
                 samples, points = self.samples(source, wavelength, depth), self.points(wavelength, depth)
@@ -201,8 +207,8 @@ class Observer:
                 tilted = light * tilted_wave(grid, wavelength, tilt).to(light) if any(tilt) else light
                 setup = tilted, grid, lengths, weights, self.display, eye
                 total += share * spectral_image(*setup, count=count, elements=elements)
-            pictures.append(pooled(total, self.scene.stride))
-        return torch.stack(pictures).cpu()
+            pictures.append(pooled(total, self.scene.stride).cpu())
+        return torch.stack(pictures)
 
     def _at_wavelength(self, light: Tensor, design: float, wavelength: float, tilt: Pair, depth: float) -> Tensor:
         """Picture [H, W] at one wavelength, with the phases of the panel there and the perspective of the eye."""

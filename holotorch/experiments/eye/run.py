@@ -28,10 +28,12 @@ from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.page import plain
 from holotorch.experiments.runs.pictures import save_picture
+from holotorch.experiments.runs.processes import added, from_first, process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.volume.config import VolumeSettings, contradictions
+from holotorch.experiments.volume.experiment import Part
 from holotorch.experiments.volume.run import fingerprint_inputs
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import picture_matrix
@@ -79,7 +81,10 @@ def visible_surface(eye: Observer) -> eye_focus.Surface | None:
 
 
 def run_observer(eye: Observer, opened: RunFolder) -> bool:
-    """Compute the observer's view and fill the folder; True if the run is complete."""
+    """Compute the observer's view, or this process's part of it, and fill the folder; True if the run is complete."""
+    if process_count()[0] > 0:
+        _Views(eye, None).compute(opened.pressed)
+        return True
     settings, folder, files, done = eye.settings, opened.path, Results(), False
     errors: dict[str, Any] = {}
     values, surface = opened.plan.values, visible_surface(eye)
@@ -128,14 +133,16 @@ class _Views:
         total: Sum of the pictures of the reference for each focus, [F, C, h, w].
         references: Number of realisations in ``total``.
         pictures: For each realisation, the pictures of all sources and foci, [sources, F, C, h, w].
-        checkpoint: The file that stores these pictures.
+        checkpoint: The file that stores these pictures; None in all processes but the first, which help it.
     """
 
-    def __init__(self, eye: Observer, checkpoint: Checkpoint):
+    def __init__(self, eye: Observer, checkpoint: Checkpoint | None):
         self.eye, self.checkpoint = eye, checkpoint
         self.total, self.references = torch.zeros(()), 0
         self.pictures: list[Tensor] = []
         self._started = self._saved = time.perf_counter()
+        if checkpoint is None:
+            return
         if content := checkpoint.load():
             try:
                 self.total, self.references = content["total"], content["references"]
@@ -161,15 +168,17 @@ class _Views:
         sources, seeds = self.eye.settings.light.sources, self.eye.settings.seeds
         # A realisation has one step of the progress bar for the hologram, and one for each picture.
         reference, measured = 1 + len(self.eye.focus), 1 + len(self.eye.focus) * len(sources)
-        done, total = self.references * reference + len(self.pictures) * measured, seeds * (8 * reference + measured)
-        with tqdm(total=total, initial=done, desc="imaging", unit="picture", dynamic_ncols=True) as bar:
+        references, pictures = from_first([self.references, len(self.pictures)])
+        done, total = references * reference + pictures * measured, seeds * (8 * reference + measured)
+        quiet = self.checkpoint is None
+        with tqdm(total=total, initial=done, desc="imaging", unit="picture", disable=quiet, dynamic_ncols=True) as bar:
             try:
-                for seed in range(_REFERENCE_SEED + self.references, _REFERENCE_SEED + 8 * seeds):
-                    pictures = self._pictures(seed, (None,), bar)[0]
+                for seed in range(_REFERENCE_SEED + references, _REFERENCE_SEED + 8 * seeds):
+                    picture = self._pictures(seed, (None,), bar)[0]
                     with deferred(pressed):
-                        self.total, self.references = self.total + pictures, self.references + 1
+                        self.total, self.references = self.total + picture, self.references + 1
                     self._save_if_due(pressed)
-                for seed in range(len(self.pictures), seeds):
+                for seed in range(pictures, seeds):
                     self.pictures.append(self._pictures(seed, sources, bar))
                     self._save_if_due(pressed)
             finally:
@@ -179,15 +188,18 @@ class _Views:
                 raise KeyboardInterrupt
 
     def _pictures(self, seed: int, sources: Sequence[str | None], bar: tqdm) -> Tensor:
-        """Pictures of a realisation, [sources, F, C, h, w]."""
-        hologram, _ = self.eye.scene.hologram(self.eye.settings.seed + seed)
+        """Pictures of a realisation, [sources, F, C, h, w]; several processes share planes and colours."""
+        (rank, count), scene = process_count(), self.eye.scene
+        part = Part(rank, count, len(scene.depths), len(scene.settings.wavelengths)) if count > 1 else None
+        hologram = added(scene.hologram(self.eye.settings.seed + seed, part=part)[0])
         bar.set_postfix(mem=f"{peak_memory() / 1e9:.2f}GB", refresh=False)
         bar.update()
         pictures = []
-        for source, depth in itertools.product(sources, self.eye.focus):
-            pictures.append(self.eye.image(hologram, source, depth))
+        for k, (source, depth) in enumerate(itertools.product(sources, self.eye.focus)):
+            colours = [c for c in range(len(hologram)) if (k * len(hologram) + c) % count == rank]
+            pictures.append(self.eye.image(hologram, source, depth, colours))
             bar.update()
-        return torch.stack(pictures).unflatten(0, (len(sources), -1))
+        return added(torch.stack(pictures)).unflatten(0, (len(sources), -1))
 
     def _save_if_due(self, pressed: list[int]) -> None:
         if pressed:  # a signal arrived while signals were deferred
@@ -197,7 +209,7 @@ class _Views:
 
     def _save(self) -> None:
         content = {"total": self.total, "references": self.references, "seen": self.pictures, "seconds": self.seconds}
-        if self.references:
+        if self.references and self.checkpoint:
             self.checkpoint.save(content)
         self._saved = time.perf_counter()
 

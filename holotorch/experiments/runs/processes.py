@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+from torch import Tensor
 
 
 @contextmanager
@@ -28,3 +29,28 @@ def process_count() -> tuple[int, int]:
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return 0, 1
+
+
+def from_first(counts: list[int]) -> list[int]:
+    """The numbers that the first process has, in all of them. ConnectionError if one has ended."""
+    values = torch.tensor(counts)
+    if process_count()[1] > 1:
+        with _connected():
+            torch.distributed.broadcast(values, 0)
+    return values.tolist()
+
+
+def added(part: Tensor) -> Tensor:
+    """Sum of the tensors of all processes, in place, in all of them. ConnectionError if one has ended."""
+    if process_count()[1] > 1:
+        with _connected():
+            torch.distributed.all_reduce(part)
+    return part
+
+
+@contextmanager
+def _connected() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:  # torch's own way to say so
+        raise ConnectionError("another process of this run has ended") from error

@@ -17,7 +17,7 @@ from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.pictures import in_colour, save_picture
-from holotorch.experiments.runs.processes import process_count
+from holotorch.experiments.runs.processes import added, from_first, process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import Pressed, deferred
 from holotorch.experiments.runs.tables import write_table
@@ -33,11 +33,8 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
     rank, count = process_count()
     planes, seeds, pressed = len(experiment.depths), experiment.settings.report.seeds, opened.pressed
     state = _State(opened.path, experiment) if rank == 0 else None  # only the first process has results
-    start, part = torch.tensor(state.evaluation.count if state else 0), None
-    if count > 1:
-        torch.distributed.broadcast(start, 0)  # all processes go on where the first process stopped
-        part = Part(rank, count, planes, len(experiment.settings.wavelengths))
-    start = int(start)
+    (start,) = from_first([state.evaluation.count if state else 0])
+    part = Part(rank, count, planes, len(experiment.settings.wavelengths)) if count > 1 else None
     total, done = planes * seeds, planes * start
     with tqdm(total=total, initial=done, desc="rendering", unit="plane", disable=not state, dynamic_ncols=True) as bar:
 
@@ -50,8 +47,7 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
             for seed in range(start, seeds):
                 started = time.perf_counter()
                 hologram, rendering = experiment.hologram(seed, advance, part)
-                if count > 1:
-                    torch.distributed.all_reduce(hologram)  # the sum of the fields of all processes
+                hologram = added(hologram)
                 seconds = time.perf_counter() - started
                 if state:
                     with deferred(pressed):

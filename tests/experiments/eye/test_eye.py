@@ -235,11 +235,11 @@ def test_interrupted_runs_keep_what_was_seen(tmp_path, monkeypatch):
     original = eye_module.Observer.image
     seen = []
 
-    def pressed(self, hologram, source, depth):
+    def pressed(self, hologram, source, *words):
         seen.append(source)
         if seen.count("led") == 2:
             signal.raise_signal(signal.SIGINT)
-        return original(self, hologram, source, depth)
+        return original(self, hologram, source, *words)
 
     monkeypatch.setattr(eye_module.Observer, "image", pressed)
     folder, complete = execute(settings("seeds=2"), tmp_path / "a", "a")

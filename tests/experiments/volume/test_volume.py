@@ -4,8 +4,6 @@ import csv
 import json
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -120,22 +118,6 @@ def test_an_interruption_while_errors_are_measured_leaves_them_to_resuming(tmp_p
     assert "measured_error" not in json.loads((tmp_path / "a" / "interrupted.json").read_text())
     assert main(["resume", str(tmp_path / "a")]) == 0
     assert json.loads((tmp_path / "a" / "summary.json").read_text())["measured_error"] > 0
-
-
-def test_several_processes_give_what_one_gives(tmp_path):
-    words = [str(CONFIGS / "tooth.yaml"), *TINY[:2], TINY[2].replace("[64, 48]", "[64, 64]"), TINY[3]]
-    assert main(["run", *words, "--out", str(tmp_path / "one")]) == 0
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=4"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [*command, "-m", "holotorch", "run", *words, "--out", str(tmp_path / "four")],
-        capture_output=True,
-        text=True,
-        env=environment,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    one, four = (np.load(tmp_path / name / "arrays" / "hologram.npy") for name in ("one", "four"))
-    assert np.linalg.norm(one - four) < 1e-6 * np.linalg.norm(one)
 
 
 @pytest.mark.parametrize("count", range(2, 12))
