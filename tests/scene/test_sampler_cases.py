@@ -291,3 +291,17 @@ def test_the_error_of_thick_slabs_is_predicted_and_warned_of(planes, front):
     assert sampler.slab_error(volume) == pytest.approx(error, rel=0.5)
     assert len(caught) == (error > 0.25), error  # once, although it is rendered twice
     assert error > 1e-3
+
+
+def test_the_error_of_very_many_slabs_follows_from_that_of_fewer():
+    values = torch.linspace(0, math.pi, 64, dtype=torch.float64).sin() ** 2
+    volume = Volume(values[:, None, None].expand(64, 4, 4).contiguous(), (1.0, 16.0, 16.0), "relative")
+
+    def error(planes: int) -> float:
+        depths = [CENTRE + WIDTH * ((k + 0.5) / planes - 0.5) for k in range(planes)]
+        return sampler(rays=Grid(4, 1e-4), depths=depths).slab_error(volume)
+
+    few = error(1000)  # none are joined
+    assert few > 0
+    for planes, joined in ((2000, 2), (16_000, 16)):
+        assert error(planes) == pytest.approx(few / joined**2, rel=0.05)
