@@ -1,4 +1,4 @@
-"""Predicted seconds of shipped configurations beside the measured ones: python scripts/predictions.py [--out FILE]."""
+"""Predicted seconds of whole commands beside the measured ones: OMP_NUM_THREADS=1 python scripts/predictions.py."""
 
 import argparse
 import json
@@ -9,25 +9,30 @@ import tempfile
 import time
 from pathlib import Path
 
-# Name, words of ``holotorch run``, and whether start-up and figures are part of the prediction.
+# Name and words of ``holotorch run``.
 RUNS = {
-    "pec fourier": (["configs/pec/fourier.yaml", "report.baselines=[]"], False),
-    "pec capped": (["configs/pec/capped.yaml", "report.baselines=[]"], False),
-    "pec fresnel": (["configs/pec/fresnel.yaml", "report.baselines=[]"], False),
-    "volume c60": (["configs/volume/c60.yaml", "scale=4"], True),
-    "volume c60, finer": (["configs/volume/c60.yaml", "scale=2"], True),
-    "volume engine": (["configs/volume/engine.yaml", "volume={phantom: shells}", "scale=4"], True),
-    "eye, laser": (
-        [
-            "configs/eye/teapot.yaml",
-            "scene={config: configs/volume/c60.yaml, change: ['hologram={shape: [256, 256], pitch: 3.74 um, "
-            "distance: 30 mm, depths: 29, rays: 128}']}",
-            "light={sources: [laser]}",
-            "seeds=1",
-        ],
-        True,
-    ),
-    "joint c60": (["configs/joint/teapot.yaml", "volume={phantom: c60}", "report.baselines=[]", "steps=20"], False),
+    "pec fourier": ["configs/pec/fourier.yaml", "report.baselines=[]"],
+    "pec fourier, baselines": ["configs/pec/fourier.yaml"],
+    "pec fourier, 48 px": ["configs/pec/fourier.yaml", "grid.shape=[48, 48]"],
+    "pec fourier, 512 px": ["configs/pec/fourier.yaml", "grid.shape=[512, 512]", "solver.max_steps=40"],
+    "pec capped": ["configs/pec/capped.yaml", "report.baselines=[]"],
+    "pec capped, baselines": ["configs/pec/capped.yaml"],
+    "pec fresnel": ["configs/pec/fresnel.yaml", "report.baselines=[]"],
+    "pec depths": ["configs/pec/depths.yaml"],
+    "pec peripheral": ["configs/pec/peripheral.yaml"],
+    "volume c60": ["configs/volume/c60.yaml", "scale=4"],
+    "volume c60, finer": ["configs/volume/c60.yaml", "scale=2"],
+    "volume engine": ["configs/volume/engine.yaml", "volume={phantom: shells}", "scale=4"],
+    "eye, laser": [
+        "configs/eye/teapot.yaml",
+        "scene={config: configs/volume/c60.yaml, change: ['hologram={shape: [256, 256], pitch: 3.74 um, "
+        "distance: 30 mm, depths: 29, rays: 128}']}",
+        "light={sources: [laser]}",
+        "seeds=1",
+    ],
+    "joint c60": ["configs/joint/teapot.yaml", "volume={phantom: c60}", "report.baselines=[]", "steps=20"],
+    "joint c60, baselines": ["configs/joint/teapot.yaml", "volume={phantom: c60}", "steps=20"],
+    "joint c60, 48 px": ["configs/joint/teapot.yaml", "volume={phantom: c60}", "display.shape=[48, 48]", "frames=5"],
 }
 
 
@@ -37,18 +42,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file to write the lines to as well")
     lines, ratios = ["run: predicted s, measured s, measured / predicted"], []
     options = parser.parse_args()
-    for name, (words, whole) in RUNS.items():
+    for name, words in RUNS.items():
         with tempfile.TemporaryDirectory() as folder:
             out, started = Path(folder) / "run", time.perf_counter()
             command = [sys.executable, "-m", "holotorch", "run", *words, "--out", str(out)]
             subprocess.run(command, check=True, capture_output=True)
-            wall = time.perf_counter() - started
+            measured = time.perf_counter() - started
             predicted = json.loads((out / "plan.json").read_text())["predicted_seconds"]
-            summary = json.loads((out / "summary.json").read_text())
-            measured = wall
-            if not whole:  # that of the solver alone, which is what these plans predict
-                methods = summary["methods"]
-                measured = methods["corrected" if "corrected" in methods else "joint"]["seconds"]
         ratios.append(measured / max(predicted, 1e-3))
         lines.append(f"{name}: {predicted:.3g}, {measured:.3g}, {ratios[-1]:.2f}")
         print(lines[-1], flush=True)

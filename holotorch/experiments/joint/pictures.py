@@ -14,7 +14,7 @@ from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_animation
 from holotorch.optics.picture import tone_map
 
-_SWEEP = 17  # foci of the animated sweep
+SWEEP = 17  # foci of the animated sweep
 _SECONDS = 0.12  # that each of them is shown
 
 
@@ -51,7 +51,7 @@ def picture(experiment: JointExperiment, images: Tensor, peak: Tensor) -> Tensor
 def sweep(experiment: JointExperiment, shown: Shown, peak: Tensor) -> bytes:
     """Animated PNG of the focus that moves through the volume and back: what is wanted, and what is shown."""
     near, far = experiment.foci[0], experiment.foci[-1]
-    count = _SWEEP if far > near else 1
+    count = SWEEP if far > near else 1
     views = experiment.at_foci(torch.linspace(near, far, count, dtype=torch.float64).tolist())
     with torch.no_grad():
         observed = shown.images(views.operator)

@@ -5,38 +5,23 @@ from typing import Any
 
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
-from holotorch.experiments.planning.machine import machine_speed
+from holotorch.experiments.joint.seconds import seconds_of, view_samples
+from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.volume.plan import dark_picture
 from holotorch.optics.light.coherence import depth_of_focus
-from holotorch.optics.viewing.pupil_views import View, view_padding
 
-# Measured on two CPU cores.
-_SAMPLE_SECONDS = 2.2e-9  # seconds / (n log2 n) of a step for one view of one frame and colour, padded to n samples
-_SAMPLE_BYTES = 40  # bytes per sample of the same, kept for the gradient
+_SAMPLE_BYTES = 40  # bytes per padded sample of a view of a frame and colour, kept for the gradient
 _BASE_BYTES = 700e6  # memory of the libraries
 _SPACING = 0.75  # of planes, in depths of focus, above which foci between them are worse (10 dB at 0.94)
-_RUNS = {
-    "random": 0.0,
-    "afterwards": 0.0,
-    "unheated": 1.0,
-    "retrieved": 0.6,
-    "retrieved_pec": 1.0,
-    "slabs": 0.4,
-}  # cost relative to that of the solver
 
 
 def plan_values(experiment: JointExperiment) -> dict[str, Any]:
     """Cost and physics as plain JSON values."""
-    settings, grid = experiment.settings, experiment.grid
-    foci, pupil = experiment.foci, View(max(experiment.foci), experiment.radius)
-    padded = view_padding(grid, settings.wavelengths, [pupil], max(foci))
+    settings, foci, padded = experiment.settings, experiment.foci, view_samples(experiment)
     views = len(foci) + settings.eye.parallax
     transforms = settings.frames * len(settings.wavelengths) * views
-    samples = math.prod(padded.shape)
-    seconds = settings.steps * transforms * _SAMPLE_SECONDS * samples * math.log2(samples)
-    seconds *= machine_speed(experiment.device).fft(samples)
-    seconds *= 1 + sum(_RUNS[name] for name in settings.report.baselines)
-    peak = _BASE_BYTES + _SAMPLE_BYTES * transforms * samples + experiment.scene.volume.values.nbytes
+    seconds = seconds_of(experiment, machine_speed(experiment.device))
+    peak = _BASE_BYTES + _SAMPLE_BYTES * transforms * math.prod(padded) + experiment.scene.volume.values.nbytes
     return {
         "volume": {"shape": list(experiment.scene.volume.shape), "synthetic": experiment.scene.synthetic},
         "foci_mm": [focus * 1e3 for focus in foci],
@@ -44,8 +29,9 @@ def plan_values(experiment: JointExperiment) -> dict[str, Any]:
         "pupil_deg": 2 * math.degrees(math.asin(experiment.radius)),
         "depth_of_focus_mm": depth_of_focus(min(settings.wavelengths), experiment.radius) * 1e3,
         "views": views,
-        "samples": list(padded.shape),
-        "predicted_seconds": round(seconds, 2),
+        "samples": list(padded),
+        "predicted_seconds": round(sum(seconds.values()), 2),
+        "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
         "predicted_peak_bytes": round(peak),
         "device": str(experiment.device),
         "notes": _notes(experiment),
@@ -71,7 +57,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",
         f"Solver     L-BFGS, {settings.steps} steps; compared with {', '.join(settings.report.baselines) or 'nothing'}",
-        f"Cost       about {values['predicted_seconds']:.2g} s, without start-up and figures; "
+        f"Cost       about {values['predicted_seconds']:.2g} s ({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     return "\n".join(lines + [f"Note       {note}" for note in values["notes"]])

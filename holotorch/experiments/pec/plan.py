@@ -6,17 +6,14 @@ from typing import Any
 
 import torch
 
-from holotorch.experiments.pec.baselines import PASSES
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
-from holotorch.experiments.planning.machine import machine_speed
+from holotorch.experiments.pec.seconds import evaluations, padded_samples, seconds_of
+from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
-# Costs on two idle cores of the reference machine of ``planning.machine``, with 128 to 1024 px. An evaluation is one
-# computation of the loss and its gradient. Predicted memory is right within 30 %.
-_PIXEL_SECONDS = 8e-9  # seconds of an evaluation per pixel, colour and frame
-_FFT_SECONDS = 0.8e-9  # seconds of an evaluation / (n log2 n) for n padded samples
+# Memory, right within 30 % with 128 to 1024 px.
 _BASE_BYTES = 450e6  # bytes of the interpreter with its libraries
 _PIXEL_BYTES = 240  # bytes per pixel, colour and frame
 _SOLVER_BYTES = 60  # bytes per padded sample in the solver
@@ -27,13 +24,8 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
     """Values of plan.json: choices with their reasons, predicted cost, and physics of the setup."""
     settings, grid = experiment.settings, experiment.grid
     padded, channels = grid.padded(2 if experiment.isolated else 1), len(experiment.wavelengths) * settings.frames
-    pixels, samples = channels * math.prod(grid.shape), channels * math.prod(padded.shape)
-    samples *= max(1, (1 + len(experiment.distances)) // 2)
-    evaluations = (2 if settings.solver.kind == "apg" else 1) * settings.solver.max_steps
-    work = evaluations + PASSES / settings.frames * len(settings.report.baselines)
-    machine = machine_speed(experiment.device)
-    transforms = _FFT_SECONDS * samples * math.log2(max(2, samples)) * machine.fft(math.prod(padded.shape))
-    seconds = work * (_PIXEL_SECONDS * pixels * machine.elementwise + transforms)
+    pixels, samples = channels * math.prod(grid.shape), channels * padded_samples(experiment)
+    seconds = seconds_of(experiment, machine_speed(experiment.device))
     solver_bytes, evaluation_bytes = _SOLVER_BYTES * samples, 0
     if experiment.distances:
         evaluation_bytes = 16 * samples + _EVALUATION_BYTES * 5 * math.prod(grid.shape)
@@ -63,8 +55,9 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
         "loss": "intensity" + free_scale,
         "device": str(experiment.device),
         "precision": "complex64 in the solver, complex128 in the evaluation",
-        "predicted_evaluations": evaluations,
-        "predicted_seconds": round(seconds, 2),
+        "predicted_evaluations": evaluations(experiment),
+        "predicted_seconds": round(sum(seconds.values()), 2),
+        "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
         "predicted_peak_bytes": round(_BASE_BYTES + _PIXEL_BYTES * pixels + max(solver_bytes, evaluation_bytes)),
         "physics": _physics(experiment),
         "notes": _notes(experiment),
@@ -107,8 +100,9 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         f"Heat       {values['heat']}",
         f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
         f"{values['start']['kind']} start ({values['start']['reason']})",
-        f"Cost       about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s, without "
-        f"start-up and figures, {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
+        f"Cost       at most about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s "
+        f"({seconds_in_words(values['seconds_of'])}), {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the "
+        "peak",
     ]
     lines += [f"Note       {note}" for note in values["notes"]]
     return "\n".join(lines)

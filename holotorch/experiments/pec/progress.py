@@ -14,7 +14,7 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.saving import Checkpoint
 
-_CHECK_STEPS = 10  # solver steps between two scores of the hologram; scoring takes about as long as a step
+CHECK_STEPS = 10  # solver steps between two scores of the hologram; scoring takes about as long as a step
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
 
 
@@ -58,7 +58,7 @@ class Log:
         """Log one step."""
         entered, step, score = time.perf_counter(), len(solution.losses) - 1, ""
         elapsed = entered - self._started
-        if step % _CHECK_STEPS == 0:
+        if step % CHECK_STEPS == 0:
             self.checked.append((step, quality(self.experiment, self.experiment.heater_phases(solution.x))))
             score = f"{self.checked[-1][1]:.6f}"
         losses = solution.losses[-1].reshape(-1, len(self.experiment.wavelengths)).mean(0).tolist()

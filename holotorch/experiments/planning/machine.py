@@ -1,6 +1,9 @@
 """Speed of this machine relative to the one on which the constants of plans were measured; measured once, then cached.
 
 Only predicted seconds depend on it. No method is chosen by it, so that results are the same on all machines.
+
+The constants of all plans, here and beside the kinds of runs, are seconds on one core (OMP_NUM_THREADS=1) of the
+reference machine, an idle x86-64 server with torch 2.13.0. With other numbers of threads the machine is measured anew.
 """
 
 import hashlib
@@ -29,10 +32,12 @@ _COPIED = 1 << 22  # float32 samples that are copied, 16 MiB
 _LOOPS = 20_000  # rounds of the interpreter
 _ROUNDS, _SECONDS = 5, 0.06  # least number of rounds and least time spent on each measurement; the fastest round counts
 _PLAUSIBLE = 1e-4, 1e4  # ratios outside are those of a damaged file
-# Seconds on one core of the reference machine (x86-64, torch 2.13.0): times that correspond to a ratio of 1.
+# Seconds on one core of the reference machine: times that correspond to a ratio of 1.
 _REFERENCE = {"small_fft": 2.0e-4, "large_fft": 5.2e-3, "elementwise": 7.6e-4, "copy": 8.3e-4, "interpreter": 7.5e-4}
 _START = 2.5  # seconds on the reference machine from the start of a command to the first computation, and for its page
 _FIGURE = 0.45  # seconds on the reference machine to draw one figure
+_SCORE = 7e-8, 3e-7  # seconds per score of a float32 value, for pictures that fit into a cache and for larger ones
+_CACHED = 1 << 18  # values of pictures that fit into a cache, at most
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,10 @@ class Machine:
     def around(self, figures: int) -> float:
         """Seconds of a command besides its computation: start-up, loading of inputs, ``figures``, and the page."""
         return self.interpreter * (_START + _FIGURE * figures)
+
+    def score(self, values: int, *, double: bool) -> float:
+        """Seconds to compare pictures of ``values`` in total with those wanted, by SSIM and PSNR."""
+        return (2 if double else 1) * values * _SCORE[values > _CACHED] * self.elementwise
 
     def __str__(self) -> str:
         words = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in asdict(self).items())
