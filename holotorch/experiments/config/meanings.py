@@ -26,7 +26,7 @@ MEANINGS = {
     "max_steps": "largest number of steps of the solver",
     "patience": "successive small changes of the loss after which it stops",
     "start": "first phases: random (hot), nearly even (flat), of least heat (cool), a lens (quadratic), or retrieved",
-    "_SolverSettings.tolerance": "relative change of the loss that counts as small",
+    "_SolverSettings.tolerance": "relative change of the loss that counts as small; by default from that of the run",
     "APGSettings.step": "first step length",
     "APGSettings.shrink": "factor on the step length after a refused step",
     "APGSettings.grow": "factor on the step length after an accepted step",

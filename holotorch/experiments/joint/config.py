@@ -20,6 +20,7 @@ from holotorch.experiments.config.settings import (
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.volume.config import Depth, TransferSettings, ViewSettings, VolumeSource
 
+PLANES = 5  # of a run without tolerance that states no number
 Baseline = Literal["random", "afterwards", "unheated", "retrieved", "retrieved_pec", "slabs"]
 
 
@@ -28,13 +29,14 @@ class DisplaySettings(GridSettings):
 
     ``distance``: of the volume's middle. ``depth``: the volume is stretched along the axis to this extent, since one as
     deep as it is wide would be sharp at every focus; not stretched by default. ``planes``: number of planes that hold
-    its light. ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
+    its light; by default 5, or as many as the tolerance of the run needs (up to 64, with slabs one per frame).
+    ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
     the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm).
     """
 
     distance: Depth
     depth: Depth | None = None
-    planes: Annotated[Count, Field(le=64)] = 5
+    planes: Annotated[Count, Field(le=64)] | None = None
     sigma_px: Annotated[Number, plausible(SIGMA_PX)] = 0.66
     max_phase: Phase = 4 * math.pi
 
@@ -80,11 +82,15 @@ class JointSettings(Settings):
     One wavelength shows the mean of the volume's colours, three show red, green and blue. ``steps``: of L-BFGS.
     ``light_weight``: weight of the light that misses the pupil or the window, against the error of the images.
     ``heat``: heat that is left from earlier frames is part of the model; by default each frame starts cold.
+    ``tolerance``: allowed relative L2 error of the images, divided between the taps of the heat kernel, the planes
+    (``display.planes``), the padding and precision of the propagation, and the stopping rule; without it all steps are
+    taken. It does not bound the error of what the array cannot form.
     """
 
     experiment: Literal["joint"]
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] | None = None
     volume: VolumeSource
     transfer: TransferSettings
     view: ViewSettings = ViewSettings()
@@ -98,10 +104,11 @@ class JointSettings(Settings):
     report: JointReport = JointReport()
 
 
-def volume_settings(settings: JointSettings) -> dict[str, Any]:
-    """The same scene as settings of kind ``volume``."""
+def volume_settings(settings: JointSettings, planes: int | None = None) -> dict[str, Any]:
+    """The same scene as settings of kind ``volume``, with ``planes`` in place of the number in the settings."""
     display = settings.display
-    hologram = {"shape": display.shape, "pitch": display.pitch, "distance": display.distance, "depths": display.planes}
+    hologram = {"shape": display.shape, "pitch": display.pitch, "distance": display.distance}
+    hologram["depths"] = (display.planes or PLANES) if planes is None else planes
     # The renderer knows three colours; one wavelength shows their mean.
     wavelengths = settings.wavelengths if len(settings.wavelengths) == 3 else settings.wavelengths[:1] * 3
     same = {name: getattr(settings, name) for name in ("seed", "device", "volume", "transfer", "view")}
@@ -129,7 +136,8 @@ def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
     if min(display.pitch) < 0.9 * max(settings.wavelengths):
         least = f"at least 0.9 of the longest wavelength, {0.9 * max(settings.wavelengths):.3g} m"
         problems.append((("display", "pitch"), f"expected {least}, got {min(display.pitch):g} m"))
-    if "slabs" in settings.report.baselines and settings.frames < display.planes:
-        hint = f"slabs shows one plane a frame and needs at least {display.planes} frames, got {settings.frames}"
+    planes = display.planes or (PLANES if settings.tolerance is None else 1)
+    if "slabs" in settings.report.baselines and settings.frames < planes:
+        hint = f"slabs shows one plane a frame and needs at least {planes} frames, got {settings.frames}"
         problems.append((("report", "baselines"), f"{hint}; leave it out"))
     return problems

@@ -1,24 +1,30 @@
 """The joint experiment: the light of a volume, the display, the views of an eye, and what they are to show."""
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
 from holotorch.correction import LBFGS, PECProblem, Solution, deconvolve, limit_peak_phase, spread_preconditioner
 from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.joint import budget as shares
 from holotorch.experiments.joint.config import JointSettings, volume_settings
+from holotorch.experiments.planning.correction import PROPAGATION
+from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.experiments.volume.experiment import build as build_volume
 from holotorch.hologram import incoherent_views
 from holotorch.modulator import HeatCycle, ThermalCrosstalk
 from holotorch.optics import PupilViews, View, disc_source, propagate
+from holotorch.optics.viewing.pupil_views import view_padding
 from holotorch.scene.layers import SlabLayers, SourceLayers
 
 _PENALTY_FROM = 0.985  # fraction of the limit above which phases are penalised, so that little is left to scale down
@@ -70,6 +76,32 @@ class JointExperiment:
         if depth is None or len(planes) == 1:
             return 1.0
         return depth / (abs(planes[-1] - planes[0]) * len(planes) / (len(planes) - 1))
+
+    @cached_property
+    def slab_error(self) -> float:
+        """Predicted relative L2 error of the rendering by so few planes."""
+        return self.scene.sampler().slab_error(self.scene.volume)
+
+    @cached_property
+    def budget(self) -> Budget:
+        """Tolerances and predicted errors of heat kernel, planes, propagation and stopping rule."""
+        return shares.joint_budget(self.settings, self.slab_error, self.padded)
+
+    def padded(self, factor: int) -> Grid:
+        """Padded grid of a view with room for light that travels ``factor`` times as far as to the farthest focus."""
+        pupil, farthest = View(max(self.foci), self.radius), factor * max(self.foci)
+        return view_padding(self.grid, self.settings.wavelengths, [pupil], farthest)
+
+    @cached_property
+    def padding(self) -> int:
+        """Factor of :meth:`padded` that the tolerance asks for."""
+        errors = {factor: shares.edge_error(self.settings, self.padded(factor)) for factor in shares.PADDINGS}
+        return shares.padding(self.settings, self.budget.share(PROPAGATION), errors)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the phases in the solver."""
+        return shares.solver_dtype(self.settings, self.budget)
 
     @cached_property
     def slabs(self) -> SlabLayers:
@@ -150,7 +182,7 @@ class JointExperiment:
 
     def views(self, views: list[View], planes: slice = slice(None)) -> Views:
         """Any views, of the light of the chosen planes."""
-        operator = PupilViews(self.grid, self.settings.wavelengths, views, longest=max(self.foci))
+        operator = PupilViews(self.grid, self.settings.wavelengths, views, longest=self.padding * max(self.foci))
         return Views(operator.to(self.device), self._images(views, planes).to(self.device) / self._mean)
 
     def _images(self, views: list[View], planes: slice = slice(None)) -> Tensor:
@@ -186,15 +218,20 @@ class JointExperiment:
     @cached_property
     def crosstalk(self) -> ThermalCrosstalk:
         """The spreading of the heat in the steady state."""
-        return ThermalCrosstalk(self.settings.display.sigma_px).to(self.device)
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan states the error
+            return ThermalCrosstalk(self.settings.display.sigma_px, shares.taps(self.settings)).to(self.device)
 
     @cached_property
     def heat(self) -> ThermalCrosstalk | HeatCycle:
         """From heater phases to the phases that the frames show, with heat that is left from earlier frames."""
+        return self.heat_after(self.crosstalk)
+
+    def heat_after(self, crosstalk: ThermalCrosstalk) -> ThermalCrosstalk | HeatCycle:
+        """The same for another spreading of the heat."""
         heat = self.settings.heat
         if heat is None:
-            return self.crosstalk
-        return HeatCycle(self.crosstalk, heat.frame_us * 1e-6, heat.time_constant_us * 1e-6).to(self.device)
+            return crosstalk
+        return HeatCycle(crosstalk, heat.frame_us * 1e-6, heat.time_constant_us * 1e-6).to(self.device)
 
     def problem(self, heat: ThermalCrosstalk | HeatCycle, views: Views, limit: float | None) -> PECProblem:
         """The loss of F frames: squared differences of the amplitudes in all views, with one scale for each colour."""
@@ -234,12 +271,13 @@ class JointExperiment:
 
     def solver(self, crosstalk: ThermalCrosstalk) -> LBFGS:
         """L-BFGS with the preconditioner of the heat kernel."""
-        return LBFGS(max_steps=self.settings.steps, precondition=spread_preconditioner(crosstalk.kernel), tolerance=0.0)
+        rule = {"tolerance": shares.stop(self.settings, self.budget), "patience": shares.PATIENCE}
+        return LBFGS(max_steps=self.settings.steps, precondition=spread_preconditioner(crosstalk.kernel), **rule)
 
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
         """Heater phases [F, C, H, W] that form all views at once, from the kinoforms of random fields."""
         problem = self.problem(self.heat, self.trained, self.settings.display.max_phase)
-        start = self.kinoform(self.random_fields(), self.crosstalk)
+        start = self.kinoform(self.random_fields(), self.crosstalk).to(self.dtype)
         return self.solver(self.crosstalk)(problem, start, callback=progress, resume=resume)
 
     def within_limit(self, phase: Tensor) -> Tensor:
@@ -253,4 +291,12 @@ class JointExperiment:
 
 def build(settings: JointSettings) -> JointExperiment:
     """Load the inputs. ConfigError for a volume or transfer function that cannot be read or used."""
-    return JointExperiment(settings, build_volume(VolumeSettings.model_validate(volume_settings(settings))))
+    scene = build_volume(VolumeSettings.model_validate(volume_settings(settings)))
+
+    def with_planes(count: int) -> VolumeExperiment:
+        return replace(scene, settings=VolumeSettings.model_validate(volume_settings(settings, count)))
+
+    def slab_error(count: int) -> float:
+        return with_planes(count).sampler().slab_error(scene.volume)
+
+    return JointExperiment(settings, with_planes(shares.choose_planes(settings, slab_error)))

@@ -3,6 +3,9 @@
 import math
 from typing import Any
 
+import torch
+
+from holotorch.experiments.joint.budget import PATIENCE, stop
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.seconds import seconds_of, view_samples
@@ -30,6 +33,10 @@ def plan_values(experiment: JointExperiment) -> dict[str, Any]:
         "depth_of_focus_mm": depth_of_focus(min(settings.wavelengths), experiment.radius) * 1e3,
         "views": views,
         "samples": list(padded),
+        **experiment.budget.values(),
+        "taps": experiment.crosstalk.kernel.shape[0],
+        "stop_below": stop(settings, experiment.budget),
+        "precision": "complex64" if experiment.dtype == torch.float32 else "complex128",
         "predicted_seconds": round(sum(seconds.values()), 2),
         "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
         "predicted_peak_bytes": round(peak),
@@ -56,11 +63,20 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"{display.max_phase / math.pi:.3g} pi{memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",
-        f"Solver     L-BFGS, {settings.steps} steps; compared with {', '.join(settings.report.baselines) or 'nothing'}",
+        f"Solver     L-BFGS, {_steps(values, settings)}; compared with "
+        f"{', '.join(settings.report.baselines) or 'nothing'}",
+        f"{experiment.budget.text}; {values['taps']} taps, {values['precision']} in the solver",
         f"Cost       about {values['predicted_seconds']:.2g} s ({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     return "\n".join(lines + [f"Note       {note}" for note in values["notes"]])
+
+
+def _steps(values: dict[str, Any], settings: JointSettings) -> str:
+    if settings.tolerance is None:
+        return f"{settings.steps} steps"
+    few = f"{PATIENCE} in a row change the loss by less than {values['stop_below']:.1e} of it"
+    return f"at most {settings.steps} steps, until {few}"
 
 
 def _left(settings: JointSettings) -> float:

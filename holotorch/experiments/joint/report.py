@@ -3,6 +3,7 @@
 from typing import Any
 
 from holotorch.experiments.joint.names import NAMES, SETS
+from holotorch.experiments.planning.errors import error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -32,6 +33,8 @@ def joint_section(record: RunRecord) -> list[str]:
         )
         parts.append(element("p", words, "warn"))
     parts += [element("p", _WORDS), _methods(summary["methods"])]
+    if words := error_sentence(summary):
+        parts.append(element("p", words))
     parts += [
         figure(source, caption + synthetic, "wide")
         for name, caption in _PICTURES.items()

@@ -11,7 +11,9 @@ from holotorch.correction.run import State
 from holotorch.experiments.joint import pictures
 from holotorch.experiments.joint.evaluation import evaluate, per_view
 from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.joint.measured import joint_errors
 from holotorch.experiments.joint.methods import Shown, baseline, show
+from holotorch.experiments.planning.errors import measured_values
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
@@ -40,7 +42,7 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
     if solution is None:
         raise KeyboardInterrupt
     with deferred(pressed):  # from here on Ctrl-C takes effect only after the results are saved
-        shown = {"joint": show(experiment, solution.x)}
+        shown = {"joint": show(experiment, solution.x.float())}
         files.write(save_array, out / "arrays" / "phase.npy", shown["joint"].phase)
     seconds = {"joint": log.seconds}
     for name in experiment.settings.report.baselines:
@@ -49,15 +51,22 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
                 shown[name], seconds[name] = timed(lambda name=name: baseline(experiment, name))
         except KeyboardInterrupt:
             pressed.append(signal.SIGINT)
+    compared = {} if pressed else measured_values(lambda: joint_errors(experiment, solution))
     with deferred(pressed):
-        summary = _write(opened, experiment, shown, seconds, solution, files)
+        summary = _write(opened, experiment, shown, seconds, solution, files) | compared
         return conclude(opened, summary, files, done=not pressed, checkpoint=log.checkpoint)
 
 
 def _fingerprint(experiment: JointExperiment) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
     _, inputs, _ = fingerprint_inputs(experiment.scene)
-    return fingerprint(experiment.settings, inputs, {"device", "report", "steps"})
+    settings = experiment.settings
+    free = {"device", "steps"}
+    if settings.tolerance is None:
+        free.add("tolerance")  # checkpoints of before there was one do not have it
+    if settings.tolerance is None or settings.display.planes is not None:
+        free.add("report")  # otherwise the number of planes depends on the methods of comparison, see budget.py
+    return fingerprint(settings, inputs, free)
 
 
 class Log:

@@ -2,10 +2,12 @@
 
 import math
 
+import torch
+
+from holotorch.experiments.joint.budget import PATIENCE
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.pictures import SWEEP
 from holotorch.experiments.planning.machine import Machine
-from holotorch.optics.viewing.pupil_views import View, view_padding
 
 # Seconds on one core of the reference machine of ``planning.machine``, with displays of 48 to 256 px.
 _CALL = 3e-3  # per step of the solver, whatever its size
@@ -17,27 +19,48 @@ _PLANNING = 0.02  # to plan that
 _DECONVOLUTION = 2e-7  # per pixel of the heaters, of the phases at the start
 _SWEEP_PIXEL = 4.7e-7  # per pixel of the animated sweep, which has the wanted pictures beside those shown
 _PANEL = 0.02  # per picture in a table of pictures
+_DOUBLE = 2.0  # time of double over that of single precision
+_FINER = 4  # factor on the time for images with twice as many samples along each axis
 _FIGURES = 3  # two tables of pictures, and the phases
 _STEPS_OF = {"random": 0.0, "afterwards": 0.0, "unheated": 1.0, "retrieved": 0.7, "retrieved_pec": 1.2, "slabs": 0.4}
 
 
 def view_samples(experiment: JointExperiment) -> tuple[int, int]:
     """Padded samples (y, x) of a view."""
-    pupil = View(max(experiment.foci), experiment.radius)
-    return view_padding(experiment.grid, experiment.settings.wavelengths, [pupil], max(experiment.foci)).shape
+    return experiment.padded(experiment.padding).shape
+
+
+def _transform(experiment: JointExperiment, machine: Machine) -> float:
+    """N log2 n for the n samples of a view, times the ratio of the machine."""
+    samples = math.prod(view_samples(experiment))
+    return samples * math.log2(samples) * machine.fft(samples)
+
+
+def step_seconds(experiment: JointExperiment, machine: Machine) -> float:
+    """One step of the solver."""
+    settings = experiment.settings
+    views = settings.frames * len(settings.wavelengths) * (len(experiment.foci) + settings.eye.parallax)
+    double = _DOUBLE if experiment.dtype == torch.float64 else 1.0
+    return _CALL * machine.interpreter + double * _STEP * views * _transform(experiment, machine)
+
+
+def shown_seconds(experiment: JointExperiment, machine: Machine) -> float:
+    """The images at all corrected foci, in double precision."""
+    settings = experiment.settings
+    views = settings.frames * len(settings.wavelengths) * len(experiment.foci)
+    return _DOUBLE * _SHOWN * views * _transform(experiment, machine)
 
 
 def seconds_of(experiment: JointExperiment, machine: Machine) -> dict[str, float]:
     """Seconds of each part of the whole command; the factors of the other methods are relative to the solver."""
     settings, planes = experiment.settings, len(experiment.foci)
     colours, fields = len(settings.wavelengths), settings.frames * len(settings.wavelengths)
-    samples, pixels = math.prod(view_samples(experiment)), math.prod(experiment.grid.shape)
-    transform = samples * math.log2(samples) * machine.fft(samples)
-    trained, scored = planes + settings.eye.parallax, 4 * planes - 1
+    transform, pixels, scored = _transform(experiment, machine), math.prod(experiment.grid.shape), 4 * planes - 1
     sweep = SWEEP if planes > 1 else 1
     start = _SOURCES * fields * planes * pixels * math.log2(pixels) * machine.fft(pixels)
     start += _PLANNING * planes * machine.interpreter + _DECONVOLUTION * fields * pixels * machine.elementwise
-    steps = settings.steps * (_CALL * machine.interpreter + _STEP * fields * trained * transform)
+    step = step_seconds(experiment, machine)
+    steps = settings.steps * step
     wanted = 5 * planes - 1 + settings.eye.parallax + sweep
     scores = machine.score(colours * planes * pixels, double=False) * scored / planes
     evaluated = _SHOWN * fields * scored * transform + scores
@@ -49,5 +72,7 @@ def seconds_of(experiment: JointExperiment, machine: Machine) -> dict[str, float
         "other methods": sum(start + _STEPS_OF[name] * steps for name in others),
         "evaluation": (2 + len(others)) * evaluated,
         "pictures": _SHOWN * fields * sweep * transform + pictures * machine.interpreter,
+        "measured error": (3 + _FINER) * shown_seconds(experiment, machine)
+        + (0.0 if settings.tolerance is None else PATIENCE * step),
         "start-up and figures": machine.around(figures=_FIGURES),
     }

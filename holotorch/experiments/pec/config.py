@@ -118,13 +118,14 @@ class NearFieldSettings(Settings):
 class _SolverSettings(Settings):
     """Solver settings. A run stops after ``patience`` successive relative changes of the loss below ``tolerance``.
 
+    By default, that follows from the tolerance of the run; if the run has none, it is 1e-3, of L-BFGS 1e-4.
     ``reruns``: how often at most a hologram with speckle noise (bright pixels that come out dark) is solved again from
     other random phases; the one with the fewest is kept.
     """
 
     kind: Any  # name of the solver, stated by each of the classes below
     max_steps: Annotated[Count, Field(le=100000)] = 400
-    tolerance: Annotated[Number, Field(ge=0)] = 1e-3
+    tolerance: Annotated[Number, Field(ge=0)] | None = None
     patience: Count = 10
     start: Start | None = None
     reruns: Annotated[int, BeforeValidator(number), Field(ge=0, le=20)] = 0
@@ -153,7 +154,6 @@ class LBFGSSettings(_SolverSettings):
     kind: Literal["lbfgs"]
     memory: Annotated[Count, Field(le=100)] = 3
     max_steps: Annotated[Count, Field(le=100000)] = 300
-    tolerance: Annotated[Number, Field(ge=0)] = 1e-4
 
 
 # Methods that the result is compared with; "unweighted" is the solver of the configuration without target.weight.
@@ -171,11 +171,17 @@ class ReportSettings(Settings):
 
 
 class PECSettings(Settings):
-    """Proximity effect correction of one picture on a thermally driven phased array."""
+    """Proximity effect correction of one picture on a thermally driven phased array.
+
+    ``tolerance``: allowed relative L2 error of the intensity, divided between the taps of the heat kernel
+    (``modulator.kernel_size``), the propagation with its precision, and the stopping rule of the solver
+    (``solver.tolerance``); it does not bound the error of the picture that the array cannot form.
+    """
 
     experiment: Literal["pec"]
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] | None = None
     grid: GridSettings
     wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)]
     target: TargetSettings

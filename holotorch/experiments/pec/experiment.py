@@ -28,8 +28,11 @@ from holotorch.correction import (
 )
 from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.pec import budget as shares
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.weight import weight_map
+from holotorch.experiments.planning.correction import solver_precision
+from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.runs.environment import find_device
 from holotorch.io.heat_kernels import load_heat_kernel
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
@@ -90,6 +93,16 @@ class PECExperiment:
     def joint(self) -> bool:
         """Whether several frames share one image and one loss."""
         return self.settings.frames > 1 and self.settings.multiplexing == "joint"
+
+    @cached_property
+    def budget(self) -> Budget:
+        """Tolerances and predicted errors of heat kernel, propagation and stopping rule."""
+        return shares.pec_budget(self.settings, self.start)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the phases in the solver."""
+        return solver_precision(shares.stop(self.settings, self.budget))
 
     @cached_property
     def image(self) -> Tensor:
@@ -177,9 +190,9 @@ class PECExperiment:
                 return Fresnel(self.grid, self.wavelengths, distance, pad=1)
             return AngularSpectrum(self.grid, self.wavelengths, distance, pad=1, band_limit=False)
 
-    def problem(self, dtype: torch.dtype = torch.float32, **options) -> PECProblem:
+    def problem(self, dtype: torch.dtype | None = None, **options) -> PECProblem:
         """The objective over the lit colours; ``options`` of :class:`PECProblem` replace those of the configuration."""
-        weights = self.weights
+        weights, dtype = self.weights, dtype or self.dtype
         configured: dict[str, Any] = {
             "mask": None if weights is None else weights.to(self.device, dtype),
             "scale_free": self.scale_free,
@@ -244,6 +257,7 @@ class PECExperiment:
         """The stages of the configured solver in order."""
         kind, crosstalk = self.settings.solver.kind, self.array.crosstalk
         options = self.settings.solver.model_dump(exclude={"kind", "start", "reruns"})
+        options["tolerance"] = shares.stop(self.settings, self.budget)
         if kind == "lbfgs":
             solver = LBFGS(precondition=spread_preconditioner(crosstalk.kernel), **options)
             return penalty_schedule(self.problem, solver, crosstalk.total, self.limit)
@@ -252,7 +266,7 @@ class PECExperiment:
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
         """Run the configured solver on the lit colours. ConfigError if it cannot start."""
         try:
-            return run_stages(self.stages(), self.start_phase(), callback=progress, resume=resume)
+            return run_stages(self.stages(), self.start_phase().to(self.dtype), callback=progress, resume=resume)
         except ValueError as error:
             raise ConfigError([f"the solver cannot start: {error}"]) from error
 
@@ -269,15 +283,15 @@ def build(settings: PECSettings) -> PECExperiment:
     if not lit.any():
         raise ConfigError([f"target.image: {settings.target.image} is black inside its crop; use target.fit: pad"])
     wavelengths = [length for length, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
-    array = PhasedArray(wavelengths, _crosstalk(settings), reference_response=settings.modulator.rad_per_K)
     # From a hot start most of the light of an isolated chip misses the window: at 128 px and sigma 0.66 the picture has
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
     isolated = getattr(settings.propagator, "boundary", None) == "isolated"
     start = settings.solver.start or ("flat" if isolated else "hot")
+    array = PhasedArray(wavelengths, _crosstalk(settings, start), reference_response=settings.modulator.rad_per_K)
     return PECExperiment(settings, source, lit, array, start, find_device(settings.device))
 
 
-def _crosstalk(settings: PECSettings) -> ThermalCrosstalk:
+def _crosstalk(settings: PECSettings, start: str) -> ThermalCrosstalk:
     """The spreading of the heat, from the width of a Gaussian or from a measured kernel."""
     chip = settings.modulator
     if chip.kernel is not None:
@@ -291,4 +305,4 @@ def _crosstalk(settings: PECSettings) -> ThermalCrosstalk:
         return crosstalk
     assert chip.sigma_px is not None  # ``contradictions`` asks for one of the two
     with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan reports lost heat in a note
-        return ThermalCrosstalk(chip.sigma_px, chip.kernel_size)
+        return ThermalCrosstalk(chip.sigma_px, shares.taps(settings, start))

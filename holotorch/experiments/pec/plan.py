@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from holotorch.experiments.pec.budget import stop
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import evaluations, padded_samples, seconds_of
@@ -34,7 +35,9 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
         propagation = plan_propagation(grid, experiment.wavelengths, list(experiment.distances))
         single = {"single_propagation": asdict(propagation)}
     crosstalk = experiment.array.crosstalk
-    size_rule = "as given" if settings.modulator.kernel_size else "chosen so that no tap above 1e-6 is dropped"
+    size_rule = "chosen so that no tap above 1e-6 is dropped" if settings.tolerance is None else "for the tolerance"
+    size_rule = "as given" if settings.modulator.kernel_size else size_rule
+    solver_dtype = "complex64" if experiment.dtype == torch.float32 else "complex128"
     free_scale = " at its best scale, since light may leave the picture" if experiment.scale_free else ""
     return {
         "propagator": settings.propagator.kind,
@@ -54,7 +57,9 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
         "start": {"kind": experiment.start, "reason": _START_REASONS[experiment.start]},
         "loss": "intensity" + free_scale,
         "device": str(experiment.device),
-        "precision": "complex64 in the solver, complex128 in the evaluation",
+        **experiment.budget.values(),
+        "stop_below": stop(settings, experiment.budget),
+        "precision": f"{solver_dtype} in the solver, complex128 in the evaluation",
         "predicted_evaluations": evaluations(experiment),
         "predicted_seconds": round(sum(seconds.values()), 2),
         "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
@@ -99,7 +104,9 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     lines += [
         f"Heat       {values['heat']}",
         f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
-        f"{values['start']['kind']} start ({values['start']['reason']})",
+        f"{values['start']['kind']} start ({values['start']['reason']}); it stops after {settings.solver.patience} "
+        f"changes of the loss below {values['stop_below']:.1e} of it",
+        f"{experiment.budget.text}; {values['precision']}",
         f"Cost       at most about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s "
         f"({seconds_in_words(values['seconds_of'])}), {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the "
         "peak",

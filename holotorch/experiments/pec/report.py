@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from holotorch.experiments.planning.errors import error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -37,7 +38,10 @@ def pec_section(run: RunRecord) -> list[str]:
     methods: dict[str, Any] = run.summary["methods"]
     parts = [heading(run.title, run.summary["status"])]
     parts.append(_table([{"method": METHOD_NAMES.get(name, name)} | _cells(each) for name, each in methods.items()]))
-    parts += [element("p", _verdict(run)), *_zone_table(methods), '<div class="row">']
+    parts.append(element("p", _verdict(run)))
+    if words := error_sentence(run.summary):
+        parts.append(element("p", words))
+    parts += [*_zone_table(methods), '<div class="row">']
     for name, caption in _PICTURES.items():
         if source := run.picture(name):
             parts.append(figure(source, f"{caption}{_score(run, name)}", "picture"))

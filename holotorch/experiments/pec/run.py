@@ -10,10 +10,12 @@ from holotorch.correction import Solution
 from holotorch.experiments.pec.baselines import baseline
 from holotorch.experiments.pec.evaluation import Result, evaluate
 from holotorch.experiments.pec.experiment import PECExperiment
+from holotorch.experiments.pec.measured import pec_errors
 from holotorch.experiments.pec.progress import Log
 from holotorch.experiments.pec.report import ISOLATED_NAME, METHOD_NAMES
 from holotorch.experiments.pec.reruns import rerun
 from holotorch.experiments.pec.weight import ZONES, eccentricities, weight_map
+from holotorch.experiments.planning.errors import measured_values
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
@@ -62,6 +64,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 pressed.append(signal.SIGINT)
             except ValueError as error:
                 print(f"{name} is left out: {error}", file=sys.stderr)
+        errors = {} if pressed else measured_values(lambda: pec_errors(experiment, solution))
         with deferred(pressed):
             if pressed:
                 log.save()
@@ -70,6 +73,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 "experiment": settings.experiment,
                 "status": "",
                 "methods": {name: result.numbers for name, result in results.items()},
+                **errors,
                 "peak_memory_bytes": peak_memory(),
             }
             return conclude(opened, summary, files, done=not pressed, checkpoint=log.checkpoint)
@@ -78,6 +82,8 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
     free = {"device", "report.baselines", "solver.reruns"}  # baselines and reruns are computed after the solver
+    if experiment.settings.tolerance is None:
+        free.add("tolerance")  # checkpoints of before there was one do not have it
     if experiment.settings.solver.kind != "lbfgs":  # the stages of L-BFGS depend on max_steps
         free.add("solver.max_steps")
     inputs: dict[str, tuple[Any, ...]] = {"target.image": (experiment.source,)}

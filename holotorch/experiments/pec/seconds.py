@@ -2,6 +2,8 @@
 
 import math
 
+import torch
+
 from holotorch.experiments.pec.baselines import PASSES
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.progress import CHECK_STEPS
@@ -13,6 +15,7 @@ _CALL = {"apg": 6e-4, "adam": 1e-3, "lbfgs": 1.6e-3}  # per evaluation, whatever
 _PIXEL = {"apg": 3e-9, "adam": 1.6e-8, "lbfgs": 3.3e-8}  # per evaluation and pixel of all colours and frames
 _IMAGE = 1.2e-8  # per evaluation and pixel of all images
 _FFT = 8e-10  # / (n log2 n) per evaluation for n padded samples of all colours and frames
+_DOUBLE = 2.0  # time of double over that of single precision
 _EVALUATIONS = {"apg": 2, "adam": 1, "lbfgs": 1}  # per step
 _PASS, _PASS_PIXEL = 3e-4, 1.5e-8  # per pass of Gerchberg-Saxton, and per pixel of it besides the transforms
 _DECONVOLUTION, _DECONVOLUTION_PIXEL = 1e-2, 1.9e-7  # of each pass of IPEC, and per pixel
@@ -39,8 +42,20 @@ def seconds_of(experiment: PECExperiment, machine: Machine) -> dict[str, float]:
         "solver": evaluations(experiment) * _evaluation(experiment, machine) + checks,
         "baselines": sum(_baseline(experiment, name, machine) for name in settings.report.baselines),
         "evaluation": methods * (2.2 * _simulation(experiment, machine) + _single_chip(experiment, machine)),
+        "measured error": 2 * simulation_seconds(experiment, machine) + extra_steps_seconds(experiment, machine),
         "start-up and figures": machine.around(figures=_FIGURES + weight) + pictures,
     }
+
+
+def simulation_seconds(experiment: PECExperiment, machine: Machine) -> float:
+    """Two float64 simulations of all frames, which one part of the measured error needs."""
+    return 2 * _simulation(experiment, machine)
+
+
+def extra_steps_seconds(experiment: PECExperiment, machine: Machine) -> float:
+    """As many further steps as the solver's patience."""
+    solver = experiment.settings.solver
+    return _EVALUATIONS[solver.kind] * solver.patience * _evaluation(experiment, machine)
 
 
 def padded_samples(experiment: PECExperiment) -> int:
@@ -63,8 +78,9 @@ def _evaluation(experiment: PECExperiment, machine: Machine) -> float:
     """One evaluation of the loss with the share of a gradient that the solver needs."""
     kind, fields = experiment.settings.solver.kind, len(experiment.wavelengths) * experiment.settings.frames
     pixels = fields * math.prod(experiment.grid.shape)
+    double = _DOUBLE if experiment.dtype == torch.float64 else 1.0
     elementwise = pixels * (_PIXEL[kind] + _IMAGE * max(1, len(experiment.distances))) * machine.elementwise
-    return _CALL[kind] * machine.interpreter + elementwise + _transforms(experiment, fields, machine)
+    return _CALL[kind] * machine.interpreter + double * (elementwise + _transforms(experiment, fields, machine))
 
 
 def _baseline(experiment: PECExperiment, name: str, machine: Machine) -> float:

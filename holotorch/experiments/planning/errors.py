@@ -1,7 +1,8 @@
 """Predicted errors beside measured ones, for summary.json and the report."""
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +39,21 @@ def error_values(comparisons: Sequence[Comparison]) -> dict[str, Any]:
         "measured_error": math.hypot(*(each.measured or 0.0 for each in measured)) if measured else None,
         "errors": [vars(each) for each in comparisons],
     }
+
+
+def measured_values(measure: Callable[[], Sequence[Comparison]]) -> dict[str, Any]:
+    """Entries of summary.json, or none if the user interrupts the measurement or memory is short.
+
+    All else of a run is computed by then, so that it is complete without them.
+    """
+    try:
+        return error_values(measure())
+    except (KeyboardInterrupt, MemoryError):
+        return {}
+    except RuntimeError as error:  # torch's own way to say so
+        if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
+            raise
+        return {}
 
 
 def error_sentence(summary: dict[str, Any]) -> str:

@@ -1,6 +1,5 @@
 """A run of the volume experiment: it can be resumed after each realisation, and several processes can share it."""
 
-import re
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.planning.errors import error_values
+from holotorch.experiments.planning.errors import measured_values
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
@@ -122,17 +121,11 @@ def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> di
     hologram = torch.from_numpy(np.load(state.out / "arrays" / "hologram.npy")).to(experiment.device)
     depths = state.evaluation.depths
     try:
-        return error_values(
-            [hologram_error(experiment), refocusing_error(experiment, hologram, depths[len(depths) // 2])]
+        return measured_values(
+            lambda: [hologram_error(experiment), refocusing_error(experiment, hologram, depths[len(depths) // 2])]
         )
     except KeyboardInterrupt:
         return None
-    except MemoryError:
-        return {}
-    except RuntimeError as error:  # torch's own way to say so
-        if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
-            raise
-        return {}
 
 
 def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, errors: dict[str, Any] | None) -> bool:

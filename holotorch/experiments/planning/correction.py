@@ -1,0 +1,106 @@
+"""Errors of the parts of a correction, as plans of kind ``pec`` and ``joint`` predict them.
+
+All errors are relative L2 errors of the intensity that the heater phases form, at its best scale.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from holotorch.modulator import ThermalCrosstalk
+
+HEAT, PROPAGATION, STOPPING = "heat", "propagation", "stopping"  # parts that share the tolerance of a run
+# Residual of a corrected picture against its target. Runs of 64 px at sigma 0.66 to 2 px left 0.01 to 0.6.
+_RESIDUAL = 0.3
+# Error of single precision in the intensity of phases of some rad; 2e-7 to 3e-6 in the same runs.
+_ROUNDING = {torch.float32: 3e-6, torch.float64: 1e-14}
+_FINEST = 1e-7  # relative change of a loss that float32 can still resolve
+_MARGIN = 4  # taps on each side by which the kernel that counts as complete is wider than one with all taps of 1e-6
+
+
+@dataclass(frozen=True)
+class HeaterPhases:
+    """Heater phases that a plan expects of the solver, in rad, and the pixels (y, x) of the array."""
+
+    mean: float
+    deviation: float
+    shape: tuple[int, int]
+
+
+def complete_kernel(sigma_px: float) -> ThermalCrosstalk:
+    """The heat kernel with all taps that make a difference in double precision of a picture."""
+    return ThermalCrosstalk(sigma_px, 2 * (ThermalCrosstalk(sigma_px).radius + _MARGIN) + 1)
+
+
+def spread_completely(sigma_px: float, phase: Tensor) -> Tensor:
+    """Heater phases [..., H, W] after the heat has spread by the complete kernel, which may be wider than the array."""
+    crosstalk, (height, width) = complete_kernel(sigma_px).to(phase.device), phase.shape[-2:]
+    room = max(0, crosstalk.radius - (min(height, width) - 1) // 2)
+    return crosstalk(functional.pad(phase, [room] * 4))[..., room : room + height, room : room + width]
+
+
+def needed_taps(sigma_px: float, taps: int) -> int | None:
+    """``taps`` for :class:`ThermalCrosstalk`; None if it takes no more by itself."""
+    return taps if taps < 2 * ThermalCrosstalk(sigma_px).radius + 1 else None
+
+
+def cropping_error(sigma_px: float, taps: int, heaters: HeaterPhases) -> float:
+    """Error of a heat kernel with ``taps`` per axis.
+
+    The dropped taps K change the phase by sum K times the mean heater phase, which only matters near the edges, where
+    half of the neighbours are missing, and by a random sum of the deviations. An rms phase error e in rad causes a
+    relative error of about e in the intensity.
+    """
+    crosstalk = complete_kernel(sigma_px)
+    dropped, kept = crosstalk.kernel.clone(), taps // 2
+    middle = slice(max(0, crosstalk.radius - kept), crosstalk.radius + kept + 1)
+    dropped[middle, middle] = 0
+    edge = min(1.0, crosstalk.radius * sum(1 / side for side in heaters.shape))  # half a kernel deep, on both sides
+    common = heaters.mean * dropped.sum().item() / 2 * math.sqrt(edge)
+    return math.hypot(common, heaters.deviation * dropped.square().sum().sqrt().item())
+
+
+def cropped_taps(sigma_px: float, share: float, heaters: HeaterPhases) -> int:
+    """Smallest odd number of taps per axis whose error is within ``share``; all taps of 1e-6 if none is."""
+    few, most = 0, ThermalCrosstalk(sigma_px).radius  # taps on each side; the error falls with their number
+    while few < most:
+        middle = (few + most) // 2
+        if cropping_error(sigma_px, 2 * middle + 1, heaters) <= share:
+            most = middle
+        else:
+            few = middle + 1
+    return 2 * most + 1
+
+
+def stopping_error(tolerance: float, patience: int) -> float:
+    """What a solver leaves that stops after ``patience`` relative changes of the loss below ``tolerance``.
+
+    It is the part of the residual that as many further steps would remove at the same rate.
+    """
+    return _RESIDUAL * math.sqrt(patience * tolerance)
+
+
+def stopping_tolerance(share: float, patience: int) -> float:
+    """Inverse of :func:`stopping_error`."""
+    return (share / _RESIDUAL) ** 2 / patience
+
+
+def solver_precision(tolerance: float) -> torch.dtype:
+    """Precision of a solver that stops at relative changes of the loss below ``tolerance``, unless that is 0."""
+    return torch.float64 if 0 < tolerance < _FINEST else torch.float32
+
+
+def rounding_error(dtype: torch.dtype) -> float:
+    """Error of a propagation in a precision, of phases of some rad."""
+    return _ROUNDING[dtype]
+
+
+def scaled_error(image: Tensor, exact: Tensor) -> float:
+    """Relative L2 error of an intensity at its best scale; 0 if both are dark."""
+    image, exact = image.double(), exact.double()
+    square, norm = image.square().sum().item(), exact.norm().item()
+    scale = (image * exact).sum().item() / square if square else 0.0
+    return (scale * image - exact).norm().item() / norm if norm else 0.0

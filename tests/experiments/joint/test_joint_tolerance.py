@@ -1,0 +1,85 @@
+"""One tolerance of a joint run: its shares, the number of planes that follows, and the measured errors."""
+
+import json
+
+import pytest
+from paths import CONFIGS
+from tiny_runs import VOLUME, command
+
+from holotorch.cli import main
+from holotorch.experiments.execute import check
+from holotorch.experiments.joint.experiment import JointExperiment, build
+from holotorch.experiments.joint.measured import joint_errors
+from holotorch.experiments.registry import load_config
+
+pytestmark = pytest.mark.usefixtures("tiny")
+WORDS = [
+    *("volume={phantom: shells, samples: 24}", VOLUME[1], "view={width: 0.3 mm}", "device=cpu", "report.baselines=[]"),
+    *("display={shape: [32, 28], pitch: 9 um, distance: 6 mm, depth: 5 mm}", "wavelengths=[520 nm]", "frames=4"),
+]
+
+
+def settings(*words: str):
+    return load_config(CONFIGS / "joint" / "teapot.yaml", [*WORDS, *words])
+
+
+def parts(values) -> dict[str, dict]:
+    return {each["part"]: each for each in values["tolerances"]}
+
+
+def test_without_a_tolerance_nothing_changes():
+    plan = check(settings())
+    assert len(plan.values["foci_mm"]) == 5 and plan.values["stop_below"] == 0 and "L-BFGS, 60 steps" in plan.text
+    assert plan.values["taps"] == 5 and plan.values["precision"] == "complex64"
+    assert list(parts(plan.values)) == ["heat", "planes", "propagation"] and "by default" in plan.text
+
+
+def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():
+    loose, tight = (check(settings(f"tolerance={each}")) for each in (0.5, 0.05))
+    assert len(loose.values["foci_mm"]) < len(tight.values["foci_mm"]) <= 64
+    assert loose.values["samples"] < tight.values["samples"]
+    assert loose.values["stop_below"] > tight.values["stop_below"] > 0
+    assert loose.values["taps"] <= tight.values["taps"] <= 5
+    assert "Tolerance  5.0e-02 = " in tight.text and "in a row change the loss by less than" in tight.text
+    assert loose.values["predicted_seconds"] < tight.values["predicted_seconds"]
+
+
+def test_a_number_of_planes_wins_and_slabs_take_no_more_than_there_are_frames():
+    given = check(settings("tolerance=0.05", "display.planes=3"))
+    assert len(given.values["foci_mm"]) == 3 and parts(given.values)["planes"]["from"] == "display.planes"
+    assert "exceeds it" in given.text
+    assert len(check(settings("tolerance=0.05", "report.baselines=[slabs]")).values["foci_mm"]) == 4
+
+
+@pytest.mark.parametrize(
+    "words",
+    [[], ["heat={frame_us: 20, time_constant_us: 10}"], ["eye.parallax=2"], ["display.planes=2"], ["display.planes=1"]],
+)
+def test_measured_errors_are_about_those_predicted(words):
+    made = build(settings("tolerance=0.3", "steps=20", *words))
+    assert isinstance(made, JointExperiment)
+    measured = {each.part: each for each in joint_errors(made, made.solve())}
+    assert list(measured) == ["heat", "planes", "propagation", "stopping"]
+    for each in measured.values():
+        assert each.measured is not None and each.measured <= 2 * each.predicted, each
+    # The prediction for one plane, far from the asymptotic error, is that of a few rays.
+    assert measured["planes"].measured == pytest.approx(measured["planes"].predicted, rel=0.5)
+
+
+def test_a_tight_tolerance_is_solved_in_double_precision():
+    made = build(settings("tolerance=0.5", "steps=3"))
+    tight = build(settings("tolerance=1e-5", "steps=3", "display.planes=1"))
+    assert str(made.solve().x.dtype) == "torch.float32" and str(tight.solve().x.dtype) in ("torch.float64")
+
+
+def test_a_reference_that_is_not_affordable_is_left_out():
+    made = build(settings("tolerance=0.5", "steps=2"))
+    assert [each.measured for each in joint_errors(made, made.solve(), limit=0.0)] == [None] * 4
+
+
+def test_a_finished_run_has_measured_beside_predicted_errors(tmp_path):
+    assert main(command("joint", tmp_path / "a", "tolerance=0.3")) == 0
+    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    assert summary["measured_error"] is not None and summary["predicted_error"] > 0
+    assert [each["part"] for each in summary["errors"]] == ["heat", "planes", "propagation", "stopping"]
+    assert "Relative L2 error. heat" in (tmp_path / "a" / "report.html").read_text()
