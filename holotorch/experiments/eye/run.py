@@ -1,7 +1,6 @@
 """Run of kind ``eye``: pictures of every source and focus, their measurements, and the files of the run folder."""
 
 import itertools
-import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from holotorch.experiments.eye.experiment import LIT, Observer
 from holotorch.experiments.eye.measured import observer_errors
 from holotorch.experiments.eye.report import by_wavelength
 from holotorch.experiments.eye.tradeoff import WHITE, fitted_prefactor, in_words, tradeoff
-from holotorch.experiments.planning.errors import error_values
+from holotorch.experiments.planning.errors import measured_values
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
@@ -60,18 +59,6 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     return scene
 
 
-def _errors(eye: Observer) -> dict[str, Any]:
-    """Predicted and measured errors; none if memory is short, since all else is computed by then."""
-    try:
-        return error_values(observer_errors(eye))
-    except MemoryError:
-        return {}
-    except RuntimeError as error:  # torch's own way to say so
-        if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
-            raise
-        return {}
-
-
 def visible_surface(eye: Observer) -> eye_focus.Surface | None:
     """The surface that the focus is swept over, or None without a sweep. ConfigError for a scene without a surface."""
     try:
@@ -85,8 +72,8 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
     if process_count()[0] > 0:
         _Views(eye, None).compute(opened.pressed)
         return True
-    settings, folder, files, done = eye.settings, opened.path, Results(), False
-    errors: dict[str, Any] = {}
+    settings, folder, files = eye.settings, opened.path, Results()
+    errors: dict[str, Any] | None = None
     values, surface = opened.plan.values, visible_surface(eye)
     (folder / "arrays").mkdir(exist_ok=True)
     files.write(write_bytes, folder / "images" / "geometry.png", eye_geometry.draw(eye))
@@ -103,8 +90,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
             cases = tradeoff(settings, eye.scene.settings, settings.tradeoff)
             files.write(write_table, folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
             print("\n".join(in_words(cases)))
-        done = True
-        errors = _errors(eye)
+        errors = measured_values(lambda: observer_errors(eye))
     except KeyboardInterrupt:
         if not views.references:
             raise
@@ -114,8 +100,8 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
             opened.write_page = None  # there is nothing to show yet
             return conclude(opened, summary, files, done=False, checkpoint=views.checkpoint)
         summary |= _write(folder, eye, views, values, files)
-        summary |= errors | {"seconds": round(views.seconds, 2), "peak_memory_bytes": peak_memory()}
-        return conclude(opened, summary, files, done=done, checkpoint=views.checkpoint)
+        summary |= (errors or {}) | {"seconds": round(views.seconds, 2), "peak_memory_bytes": peak_memory()}
+        return conclude(opened, summary, files, done=errors is not None, checkpoint=views.checkpoint)
 
 
 def _fingerprint(eye: Observer) -> Fingerprint:

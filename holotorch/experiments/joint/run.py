@@ -51,10 +51,10 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
                 shown[name], seconds[name] = timed(lambda name=name: baseline(experiment, name))
         except KeyboardInterrupt:
             pressed.append(signal.SIGINT)
-    compared = {} if pressed else measured_values(lambda: joint_errors(experiment, solution))
+    compared = None if pressed else measured_values(lambda: joint_errors(experiment, solution))
     with deferred(pressed):
-        summary = _write(opened, experiment, shown, seconds, solution, files) | compared
-        return conclude(opened, summary, files, done=not pressed, checkpoint=log.checkpoint)
+        summary = _write(opened, experiment, shown, seconds, solution, files) | (compared or {})
+        return conclude(opened, summary, files, done=compared is not None, checkpoint=log.checkpoint)
 
 
 def _fingerprint(experiment: JointExperiment) -> Fingerprint:

@@ -64,7 +64,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 pressed.append(signal.SIGINT)
             except ValueError as error:
                 print(f"{name} is left out: {error}", file=sys.stderr)
-        errors = {} if pressed else measured_values(lambda: pec_errors(experiment, solution))
+        errors = None if pressed else measured_values(lambda: pec_errors(experiment, solution))
         with deferred(pressed):
             if pressed:
                 log.save()
@@ -73,10 +73,10 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 "experiment": settings.experiment,
                 "status": "",
                 "methods": {name: result.numbers for name, result in results.items()},
-                **errors,
+                **(errors or {}),
                 "peak_memory_bytes": peak_memory(),
             }
-            return conclude(opened, summary, files, done=not pressed, checkpoint=log.checkpoint)
+            return conclude(opened, summary, files, done=errors is not None, checkpoint=log.checkpoint)
 
 
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:

@@ -41,14 +41,16 @@ def error_values(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     }
 
 
-def measured_values(measure: Callable[[], Sequence[Comparison]]) -> dict[str, Any]:
-    """Entries of summary.json, or none if the user interrupts the measurement or memory is short.
+def measured_values(measure: Callable[[], Sequence[Comparison]]) -> dict[str, Any] | None:
+    """Entries of summary.json; none if memory is short, since all else of a run is computed by then.
 
-    All else of a run is computed by then, so that it is complete without them.
+    None, for a run that is not complete, if a signal interrupts the measurement: resuming measures them.
     """
     try:
         return error_values(measure())
-    except (KeyboardInterrupt, MemoryError):
+    except KeyboardInterrupt:
+        return None
+    except MemoryError:
         return {}
     except RuntimeError as error:  # torch's own way to say so
         if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):

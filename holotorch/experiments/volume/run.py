@@ -112,20 +112,14 @@ class _State:
 
 
 def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> dict[str, Any] | None:
-    """Predicted and measured errors of all realisations, for the summary; None after an interruption.
-
-    None are measured if memory is short, since all else is computed by then.
-    """
+    """Predicted and measured errors of all realisations, for the summary; None after an interruption."""
     if pressed or state.evaluation.count < experiment.settings.report.seeds:
         return None
     hologram = torch.from_numpy(np.load(state.out / "arrays" / "hologram.npy")).to(experiment.device)
     depths = state.evaluation.depths
-    try:
-        return measured_values(
-            lambda: [hologram_error(experiment), refocusing_error(experiment, hologram, depths[len(depths) // 2])]
-        )
-    except KeyboardInterrupt:
-        return None
+    return measured_values(
+        lambda: [hologram_error(experiment), refocusing_error(experiment, hologram, depths[len(depths) // 2])]
+    )
 
 
 def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, errors: dict[str, Any] | None) -> bool:
