@@ -47,7 +47,7 @@ def test_the_numbers_of_a_design_are_those_on_its_page():
 
 def test_the_network_of_its_page_learns():
     losses = [float(line.split()[1]) for line in printed("train_with_it.md").splitlines()]
-    assert losses[-1] < 0.5 * losses[0]
+    assert losses[-1] < 0.6 * losses[0]
 
 
 @pytest.fixture(scope="module")

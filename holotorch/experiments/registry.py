@@ -9,6 +9,7 @@ from holotorch.experiments.config.messages import nearest, validated
 from holotorch.experiments.config.source import read_source
 from holotorch.experiments.config.version import upgraded
 from holotorch.experiments.kind import ExperimentKind
+from holotorch.io.bundled import find_config
 
 # Name of a kind in YAML, and the package whose module ``kind`` defines that kind; the module is loaded on demand.
 KINDS = {
@@ -32,9 +33,10 @@ def find_kind(name: str) -> ExperimentKind[Any, Any]:
 def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     """Read a configuration, apply overrides ``key=value`` and validate it; returns the settings of its kind.
 
+    ``path`` is a file, or the name of a configuration that comes with holotorch, such as "configs/demo.yaml".
     ConfigError with all mistakes, one line each with file, line and column.
     """
-    source = upgraded(read_source(Path(path), overrides or []))
+    source = upgraded(read_source(find_config(path) or Path(path), overrides or []))
     name = source.data.get("experiment")
     if not isinstance(name, str) or name not in KINDS:
         got = f"got {name!r}" + nearest(str(name), list(KINDS)) if "experiment" in source.data else "it is missing"

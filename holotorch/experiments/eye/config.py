@@ -1,6 +1,6 @@
 """Settings of an observer's view of a hologram."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
@@ -135,6 +135,11 @@ class ObserverSettings(Settings):
     part of the scene looks sharpest. ``tradeoff``: distances of the scene at which the best spectral width of each
     colour is determined.
     """
+
+    elsewhere: ClassVar[dict[str, str]] = {
+        key: f"the scene has it; write 'scene.change=[\"{key}.KEY=VALUE\"]', or give a scene.config of your own"
+        for key in ("hologram", "view")
+    }
 
     experiment: Literal["eye"]
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**62)] = 0

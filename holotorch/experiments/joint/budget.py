@@ -115,5 +115,5 @@ def _parts(settings: JointSettings, error_of_planes: float, error_of_edges: floa
 def _heaters(settings: JointSettings) -> HeaterPhases:
     display = settings.display
     total = ThermalCrosstalk(display.sigma_px).total
-    limit = display.max_phase / total
+    limit = settings.limit / total
     return HeaterPhases(min(2 * math.pi / total, limit), min(_DEVIATION, limit), display.shape)

@@ -1,7 +1,7 @@
 """Settings of a volume that is shown by frames of a phased array and corrected for what an eye sees of it."""
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -12,6 +12,7 @@ from holotorch.experiments.config.settings import (
     Number,
     Phase,
     Settings,
+    TemperatureRise,
     Wavelength,
     number,
     plausible,
@@ -20,6 +21,7 @@ from holotorch.experiments.config.settings import (
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.volume.config import Depth, TransferSettings, ViewSettings, VolumeSource
 
+_REFERENCE = 630e-9  # metres, wavelength of ``display.rad_per_K``
 PLANES = 5  # of a run without tolerance that states no number
 Baseline = Literal["random", "afterwards", "unheated", "retrieved", "retrieved_pec", "slabs"]
 
@@ -31,7 +33,9 @@ class DisplaySettings(GridSettings):
     deep as it is wide would be sharp at every focus; not stretched by default. ``planes``: number of planes that hold
     its light; by default 5, or as many as the tolerance of the run needs (up to 64, with slabs one per frame).
     ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
-    the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm).
+    the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm). ``max_temperature``: in its place a
+    limit on the temperature of every pixel above ambient, such as 500 degC, which all colours share, see
+    :meth:`JointSettings.limit`. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
     """
 
     distance: Depth
@@ -39,6 +43,8 @@ class DisplaySettings(GridSettings):
     planes: Annotated[Count, Field(le=64)] | None = None
     sigma_px: Annotated[Number, plausible(SIGMA_PX)] = 0.66
     max_phase: Phase = 4 * math.pi
+    max_temperature: TemperatureRise | None = None
+    rad_per_K: Annotated[Number, Field(ge=1e-5, le=10)] = math.pi / 175
 
 
 class EyeSettings(Settings):
@@ -87,6 +93,12 @@ class JointSettings(Settings):
     taken. It does not bound the error of what the array cannot form.
     """
 
+    elsewhere: ClassVar[dict[str, str]] = {
+        "modulator": "display describes the chip, by sigma_px, max_phase or max_temperature, and rad_per_K; a measured "
+        "kernel is of kind pec only, whose check tells the sigma_px that fits it best",
+        "hologram": "display has shape, pitch, distance and planes",
+    }
+
     experiment: Literal["joint"]
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -102,6 +114,17 @@ class JointSettings(Settings):
     heat: HeatSettings | None = None
     steps: Annotated[Count, Field(le=100000)] = 60
     report: JointReport = JointReport()
+
+    @property
+    def limit(self) -> float:
+        """Upper limit in rad on the phase after the heat has spread, of all colours.
+
+        A limit on the temperature is that of the colour whose phase is smallest at this temperature.
+        """
+        display = self.display
+        if display.max_temperature is None:
+            return display.max_phase
+        return display.max_temperature * display.rad_per_K * _REFERENCE / max(self.wavelengths)
 
 
 def volume_settings(settings: JointSettings, planes: int | None = None) -> dict[str, Any]:

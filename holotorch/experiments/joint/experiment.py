@@ -276,13 +276,13 @@ class JointExperiment:
 
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
         """Heater phases [F, C, H, W] that form all views at once, from the kinoforms of random fields."""
-        problem = self.problem(self.heat, self.trained, self.settings.display.max_phase)
+        problem = self.problem(self.heat, self.trained, self.settings.limit)
         start = self.kinoform(self.random_fields(), self.crosstalk).to(self.dtype)
         return self.solver(self.crosstalk)(problem, start, callback=progress, resume=resume)
 
     def within_limit(self, phase: Tensor) -> Tensor:
         """Heater phases scaled down where a phase after spreading exceeds the limit."""
-        return limit_peak_phase(self.settings.display.max_phase, phase, self.heat)
+        return limit_peak_phase(self.settings.limit, phase, self.heat)
 
     def emitted(self, phase: Tensor) -> Tensor:
         """Fields [F, C, H, W] that heater phases of F frames emit."""

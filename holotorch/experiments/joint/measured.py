@@ -91,7 +91,7 @@ def _planes(experiment: JointExperiment, _: Solution) -> tuple[float, str]:
 
 def _stopping(experiment: JointExperiment, solution: Solution) -> tuple[float | None, str]:
     """Change of the images in further steps, as many as the solver's patience."""
-    problem = experiment.problem(experiment.heat, experiment.trained, experiment.settings.display.max_phase)
+    problem = experiment.problem(experiment.heat, experiment.trained, experiment.settings.limit)
     solver = replace(experiment.solver(experiment.crosstalk), max_steps=PATIENCE, tolerance=0.0)
     try:
         further = solver(problem, solution.x)

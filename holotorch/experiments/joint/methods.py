@@ -81,7 +81,7 @@ def _slabs(experiment: JointExperiment) -> Shown:
         start = experiment.kinoform(fields(slice(j, j + 1))[own], experiment.crosstalk)
         # A colour without light in this plane keeps the start, and its laser off.
         wanted = torch.where(lit[:, None, None, None], views.images, 1.0)
-        limit = experiment.settings.display.max_phase
+        limit = experiment.settings.limit
         problem = experiment.problem(experiment.crosstalk, replace(views, images=wanted), limit)
         x = experiment.solver(experiment.crosstalk)(problem, start).x
         formed = problem.intensity(x).detach()

@@ -60,7 +60,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; heat spreads over {display.sigma_px:g} px, phases up to "
-        f"{display.max_phase / math.pi:.3g} pi{memory}",
+        f"{settings.limit / math.pi:.3g} pi{memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",
         f"Solver     L-BFGS, {_steps(values, settings)}; compared with "
@@ -100,6 +100,6 @@ def _notes(experiment: JointExperiment) -> list[str]:
         )
     if settings.eye.pupil > 0.5:
         notes.append("the pupil is wider than half the band of the pixels, which do not resolve its image fully")
-    if settings.display.max_phase < math.pi:
+    if settings.limit < math.pi:
         notes.append("phases below pi cannot form images of high contrast; expect little light in them")
     return notes

@@ -54,7 +54,7 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
     compared = None if pressed else measured_values(lambda: joint_errors(experiment, solution))
     with deferred(pressed):
         summary = _write(opened, experiment, shown, seconds, solution, files) | (compared or {})
-        return conclude(opened, summary, files, done=compared is not None, checkpoint=log.checkpoint)
+        return conclude(opened, summary, files, done=compared is not None and not pressed, checkpoint=log.checkpoint)
 
 
 def _fingerprint(experiment: JointExperiment) -> Fingerprint:

@@ -157,8 +157,9 @@ def _load(folder: Path) -> _Chip:
             return _Chip(phase, experiment.array, experiment.array.crosstalk, experiment.limit)
         if isinstance(settings, JointSettings):
             joint = build_joint(settings)
-            array = PhasedArray(settings.wavelengths, joint.crosstalk.cpu())
-            return _Chip(joint_heaters(folder, settings).double(), array, joint.heat.cpu(), settings.display.max_phase)
+            response = settings.display.rad_per_K
+            array = PhasedArray(settings.wavelengths, joint.crosstalk.cpu(), reference_response=response)
+            return _Chip(joint_heaters(folder, settings).double(), array, joint.heat.cpu(), settings.limit)
     except ConfigError:
         raise
     except ValueError as error:

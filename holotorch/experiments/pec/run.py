@@ -76,7 +76,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 **(errors or {}),
                 "peak_memory_bytes": peak_memory(),
             }
-            return conclude(opened, summary, files, done=errors is not None, checkpoint=log.checkpoint)
+            return conclude(opened, summary, files, done=errors is not None and not pressed, checkpoint=log.checkpoint)
 
 
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:

@@ -72,6 +72,7 @@ def mistakes(path: Path, *overrides: str) -> list[str]:
             "hologram.distance=360",
             "expected a length within -10 m .. 10 m, got 360; 360 means metres: did you mean '360 mm'?",
         ),
+        (EYE, "hologram.shape=64", "the scene has it; write 'scene.change=[\"hologram.KEY=VALUE\"]'"),
         (VOLUME, "view.width=1e-300", "view.width: expected a length within 1 nm .. 10 m"),
         (CORRECTION, "solver.max_steps=1000000000000", "solver.max_steps: expected less than or equal to 100000"),
         (VOLUME, "volume.dtype=cpu", "volume.dtype: expected a type of number, such as uint8, float32"),

@@ -135,6 +135,18 @@ def test_heat_that_is_left_from_earlier_frames_is_in_the_files(tiny, tmp_path):
     assert report["peak_temperature_K"] == pytest.approx(hottest, rel=1e-4)
 
 
+def test_a_volume_keeps_a_limit_in_degrees_of_an_own_chip(tiny, tmp_path):
+    config, *words = RUNS["joint"]
+    words += ["report.baselines=[]", "display.max_temperature=150 degC", "display.rad_per_K=0.03", "steps=20"]
+    run = tmp_path / "run"
+    assert execute(load_config(CONFIGS / config, words), run)[1]
+    _, report = export_heaters(run)
+    wavelengths = report["wavelengths_m"]
+    assert report["rad_per_K"] == pytest.approx([0.03 * 630e-9 / wavelength for wavelength in wavelengths])
+    assert report["limit_rad"] == pytest.approx(150 * 0.03 * 630e-9 / max(wavelengths))
+    assert 100 < report["peak_temperature_K"] <= 150 * (1 + 1e-6)
+
+
 def test_coarse_levels_above_the_limit_are_warned_of_and_files_of_near_colours_stay_apart(tmp_path, capsys):
     chip = "{sigma_px: 0.66, kernel_size: 5, max_temperature: 300 degC, rad_per_K: 0.03}"
     run = tmp_path / "run"

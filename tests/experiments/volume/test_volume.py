@@ -181,11 +181,13 @@ def test_a_file_is_read_and_a_broken_one_named(tmp_path):
         build(settings(f"volume={{path: {tmp_path / 'nan.npy'}, spacing: 1, unit: relative}}"))
 
 
-def test_an_empty_volume_is_black(tmp_path):
+def test_an_empty_volume_is_black_and_said_to_be(tmp_path, capsys):
     np.save(tmp_path / "empty.npy", np.zeros((4, 4, 4), np.uint8))
     folder, _ = execute(
         settings(f"volume={{path: {tmp_path / 'empty.npy'}, spacing: 1, unit: relative}}"), tmp_path / "a", "a"
     )
+    assert "WARNING    100 % of the picture is black" in capsys.readouterr().out
+    assert "100 % of the picture is black" in (folder / "report.html").read_text()
     assert not np.load(folder / "arrays" / "hologram.npy").any()
     assert np.isfinite(np.load(folder / "arrays" / "refocused.npy")).all()
     assert summary(folder)["speckle_contrast"] is None
