@@ -80,9 +80,9 @@ def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str)
     if kinds and len(location) > 2:
         whole = f"to change the kind give the whole section, as in '{location[-3]}={{kind: {kinds[0]}}}'"
         return f"a setting of kind {' and '.join(kinds)}, not of {location[-2]}; {whole}"
-    advice = [each.elsewhere[name] for each in _options_at(model, location[:-1]) if name in each.elsewhere]
-    if advice:
-        return f"no setting of this kind of run: {advice[0]}"
+    for section in _options_at(model, location[:-1]):
+        if advice := getattr(section, "elsewhere", {}).get(name):
+            return f"no setting of this kind of run: {advice}"
     known = [key for section in _options_at(model, location[:-1]) for key in section.model_fields]
     return "unknown setting" + nearest(name, known)
 
