@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -39,6 +40,9 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         explanation = str(error) if isinstance(error, MemoryError) else ""
         print(explanation or "out of memory; use a smaller grid", file=sys.stderr)
+        return FAILED
+    except BrokenPipeError:  # the reader has left, as ``head`` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that Python does not fail at its end
         return FAILED
     except ConnectionError as error:
         print(error, file=sys.stderr)

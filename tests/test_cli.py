@@ -158,6 +158,13 @@ def test_a_full_disk_is_a_failure_without_a_traceback(monkeypatch, capsys):
     assert (folder / "checkpoint.pt").is_file() and (folder / "interrupted.json").is_file()
 
 
+def test_a_reader_that_leaves_early_is_no_error():
+    done = subprocess.run(
+        f"{sys.executable} -m holotorch keys pec | head -1", shell=True, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("experiment") and done.stderr == ""
+
+
 def test_out_of_memory_is_a_failure_without_a_traceback(monkeypatch, capsys):
     def greedy(*_):
         import torch

@@ -138,6 +138,9 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
     return values | {"fitted_sigma_px": fitted.sigma_px, "fit_residual": residual}
 
 
+_NO_GAUSSIAN = 0.05  # rest of a fit above which corrections for the Gaussian lose much of their gain
+
+
 def _crosstalk_line(values: dict[str, Any]) -> str:
     if "kernel" in values:
         line = f"Crosstalk  measured kernel {values['kernel']}, {' x '.join(map(str, values['taps']))} px"
@@ -146,6 +149,8 @@ def _crosstalk_line(values: dict[str, Any]) -> str:
                 f"; the Gaussian that fits it best has sigma {values['fitted_sigma_px']:.3g} px and leaves "
                 f"{values['fit_residual']:.2g} of it (rms)"
             )
+            if values["fit_residual"] > _NO_GAUSSIAN:
+                line += ": no Gaussian stands for this kernel where only a sigma can be given"
         return line
     return (
         f"Crosstalk  heat spreads with sigma {values['sigma_px']:g} px over {values['taps']} taps "

@@ -71,7 +71,11 @@ class CameraSettings(Settings):
 
 
 class CatheterSettings(Settings):
-    """A catheter; see ``Catheter``. ``edges``: distances of the band edges from the tip; ``colours``: sRGB triples."""
+    """A catheter; see ``Catheter``.
+
+    ``edges``: distances of the band edges from the tip, four or more, since those of two bands leave no pose that could
+    be verified. ``colours``: sRGB triples.
+    """
 
     edges: Annotated[tuple[Annotated[Length, plausible(TOOL_POSITION)], ...], Field(min_length=4)]
     colours: tuple[tuple[Level, Level, Level], ...]
