@@ -129,6 +129,8 @@ def cells(folder: Path = FOLDER, guides: Path = GUIDES) -> list[Cell]:
     """All cells of ``tables.yaml``. ValueError for a row that is not in its guide once, or without its cells."""
     found = []
     for table in load(folder / "tables.yaml"):
+        if "row" not in table:
+            continue
         lines = (guides / f"{table['guide']}.md").read_text(encoding="utf-8").splitlines()
         rows = [line for line in lines if line.startswith(table["row"])]
         if len(rows) != 1:
@@ -138,14 +140,35 @@ def cells(folder: Path = FOLDER, guides: Path = GUIDES) -> list[Cell]:
             raise ValueError(f"{table['guide']}: too few cells in {rows[0]!r}")
         for text, cell in zip(texts, table["cells"], strict=False):
             numbers = re.findall(r"\d+(?:\.\d+)?", text)
-            found.append(Cell(table["guide"], table["row"], numbers, _columns((folder / cell["file"]).resolve(), cell)))
+            parts = cell if isinstance(cell, list) else [cell]
+            values = [value for part in parts for value in _columns((folder / part["file"]).resolve(), part)]
+            found.append(Cell(table["guide"], table["row"], numbers, values))
     return found
 
 
+def bare_rows(guide: str, folder: Path = FOLDER, guides: Path = GUIDES) -> list[str]:
+    """Rows of a guide's tables that show what looks measured, and that are not in ``tables.yaml``."""
+    tables = [table for table in load(folder / "tables.yaml") if table["guide"] == guide]
+    known = [row for table in tables for row in (table.get("not_measured") or [table["row"]])]
+    lines = (guides / f"{guide}.md").read_text(encoding="utf-8").splitlines()
+    if stale := [row for row in known if not any(line.startswith(row) for line in lines)]:
+        raise ValueError(f"{guide}: no longer there: {stale}")
+    rows = [line for line in lines if line.startswith("|") and not line.startswith(tuple(known) or "-")]
+    return [line for line in rows if MEASURED.search(NAMES.sub("", line))]
+
+
 def _columns(path: Path, cell: dict[str, Any]) -> list[float]:
-    """The value of each column in the rows of a CSV file that a cell names: the only one, or the smallest."""
+    """The values that a cell names: of each column in rows of a CSV file, the only one or the smallest; or of JSON.
+
+    A list in JSON counts by its mean.
+    """
+    scale = cell.get("scale", 1)
+    if "json" in cell:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        values = [reduce(_entry, name.split("."), data) for name in cell["json"]]
+        return [scale * (statistics.fmean(value) if isinstance(value, list) else value) for value in values]
     rows = _rows(path.read_text(encoding="utf-8"), cell["rows"], one=not cell.get("worst"))
-    return [min(float(row[column]) for row in rows) for column in cell["columns"]]
+    return [scale * min(float(row[column]) for row in rows) for column in cell["columns"]]
 
 
 class Quote(NamedTuple):

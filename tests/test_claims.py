@@ -71,6 +71,26 @@ def test_a_number_in_the_prose_of_a_guide_has_a_row(path):
     assert not CLAIMS.uncovered(name), "add a row to scripts/charts/claims/prose.yaml"
 
 
+# The tables of the other two pages show sections of the dissertation, and licences.
+TABLES = [path for path in GUIDES if path.stem not in ("dissertation", "changes")]
+
+
+@pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
+def test_a_number_in_a_table_of_a_guide_has_a_row(path):
+    """A row of a table with numbers that look measured is in tables.yaml, as measured or as not."""
+    name = str(path.relative_to(CLAIMS.GUIDES).with_suffix(""))
+    assert not CLAIMS.bare_rows(name), "add the row to scripts/charts/claims/tables.yaml"
+
+
+def test_a_row_of_a_table_without_its_file_is_caught(tmp_path):
+    (tmp_path / "guide.md").write_text("| a | SSIM |\n|---|---|\n| b | 0.51 |\n| c | 14 dB |\n| d | 7 |\n")
+    (tmp_path / "tables.yaml").write_text("- {guide: guide, not_measured: ['| c |']}")
+    assert CLAIMS.bare_rows("guide", tmp_path, tmp_path) == ["| b | 0.51 |"]
+    (tmp_path / "tables.yaml").write_text("- {guide: guide, not_measured: ['| e |']}")
+    with pytest.raises(ValueError, match="no longer there"):
+        CLAIMS.bare_rows("guide", tmp_path, tmp_path)
+
+
 def test_files_of_the_lists_of_tests_are_there():
     missing = [file for row in CLAIMS.load(CLAIMS.FOLDER / "prose.yaml") for file in row.get("in_tests", {}).values()]
     assert missing and all((ROOT / file).is_file() for file in missing)
