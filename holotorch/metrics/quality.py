@@ -1,5 +1,8 @@
 """Image quality metrics, one value per image and channel."""
 
+from importlib.util import find_spec
+from pathlib import Path
+
 import torch
 from torch import Tensor, nn
 
@@ -67,6 +70,12 @@ class PerceptualSimilarity(nn.Module):
             install = "pip install 'holotorch[lpips]'"
             raise ImportError(f"LPIPS is an extra of holotorch; install it with: {install}") from error
         self.distance = LPIPS(net="alex", verbose=False).requires_grad_(False)
+
+    @staticmethod
+    def is_there() -> bool:
+        """Whether the constructor succeeds without a download."""
+        weights = Path(torch.hub.get_dir()) / "checkpoints" / "alexnet-owt-7be5be79.pth"
+        return find_spec("lpips") is not None and weights.is_file()
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
         """Similarity [...] of images [..., C, H, W] with values in [0, 1].

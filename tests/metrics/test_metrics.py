@@ -90,6 +90,15 @@ def test_perceptual_similarity_shows_the_network_what_it_was_trained_on(monkeypa
         similarity(torch.rand(2, 16, 16), torch.rand(2, 16, 16))
 
 
+def test_weights_that_are_there_need_no_download(monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr("holotorch.metrics.quality.find_spec", lambda name: name)
+    assert not PerceptualSimilarity.is_there()
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").touch()
+    assert PerceptualSimilarity.is_there()
+
+
 def test_perceptual_similarity_names_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "lpips", None)
     with pytest.raises(ImportError, match=r"pip install 'holotorch\[lpips\]'"):

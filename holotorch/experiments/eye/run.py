@@ -37,6 +37,7 @@ from holotorch.experiments.volume.run import fingerprint_inputs
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import picture_matrix
 from holotorch.io.files import save_array, write_bytes
+from holotorch.metrics import PerceptualSimilarity
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
@@ -87,7 +88,10 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
             files.write(write_bytes, folder / "images" / "focus.png", drawn)
             print("\n".join(eye_focus.in_words(sweep)))
         if settings.tradeoff:
-            cases = tradeoff(settings, eye.scene.settings, settings.tradeoff)
+            similarity = PerceptualSimilarity() if PerceptualSimilarity.is_there() else None
+            if similarity is None:
+                print("tradeoff.csv is without LPIPS, whose weights are not here; see PerceptualSimilarity")
+            cases = tradeoff(settings, eye.scene.settings, settings.tradeoff, similarity=similarity)
             files.write(write_table, folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
             print("\n".join(in_words(cases)))
         errors = measured_values(lambda: observer_errors(eye))

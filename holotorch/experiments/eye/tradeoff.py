@@ -1,7 +1,7 @@
 """Speckle against sharpness: the spectral width with the best picture, per colour and distance (thesis Sec. 6.4.2)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +46,7 @@ class Case:
         contrast: Speckle contrast for each of ``WIDTHS``.
         best: FWHM in metres with the highest SSIM, see :func:`parabola_peak`.
         inside: Whether ``best`` lies inside the range of ``WIDTHS``.
+        lpips: Perceptual similarity to the same mean picture for each of ``WIDTHS``; None without its weights.
     """
 
     distance: float
@@ -55,6 +56,7 @@ class Case:
     contrast: tuple[float, ...]
     best: float
     inside: bool
+    lpips: tuple[float, ...] | None = None
 
     def formula(self, prefactor: float) -> float:
         """Best FWHM in metres by the closed form ``optimum_fwhm``; NaN for a prefactor of NaN."""
@@ -66,7 +68,9 @@ class Case:
         difference = path_difference(self.distance, self.aperture)
         spectra = (Spectrum.lorentzian(self.wavelength, width) for width in WIDTHS)
         predicted = [predicted_contrast(spectrum, difference) for spectrum in spectra]
-        by_width = (("ssim", self.ssim, 4), ("contrast", self.contrast, 3), ("predicted", predicted, 3))
+        by_width = [("ssim", self.ssim, 4), ("contrast", self.contrast, 3), ("predicted", predicted, 3)]
+        if self.lpips is not None:
+            by_width.append(("lpips", self.lpips, 4))
         return {
             "distance_mm": self.distance * 1e3,
             "wavelength_nm": round(self.wavelength * 1e9),
@@ -87,12 +91,19 @@ class Case:
 
 
 def tradeoff(
-    settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
+    settings: ObserverSettings,
+    scene: VolumeSettings,
+    distances: tuple[float, ...],
+    *,
+    seeds: int = 2,
+    others: int = 12,
+    similarity: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> list[Case]:
     """Compute a case for every distance (metres) and colour, with the eye focused on the middle of the scene.
 
     ``seeds`` realisations of the random phases are compared with the mean picture of ``others`` further realisations.
-    Propagation is always collapsed, because each hologram needs many propagations per colour.
+    Propagation is always collapsed, because each hologram needs many propagations per colour. ``similarity``, such as
+    ``PerceptualSimilarity()``, judges pictures [..., 1, h, w] beside SSIM.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
@@ -102,7 +113,8 @@ def tradeoff(
         reference_holograms = [eye.scene.hologram(_REFERENCE_SEED + seed)[0] for seed in range(others)]
         for colour, wavelength in enumerate(moved.wavelengths):
             images = torch.stack([_image(eye, each[colour], wavelength) for each in reference_holograms])
-            cases.append(_case(eye, colour, wavelength, holograms, seed_statistics(images).mean))
+            reference = seed_statistics(images).mean
+            cases.append(_case(eye, colour, wavelength, holograms, reference, similarity))
     return cases
 
 
@@ -112,7 +124,14 @@ def _image(eye: Observer, field: Tensor, wavelength: float) -> Tensor:
     return pooled(intensity(image[0]), eye.scene.stride)
 
 
-def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor], reference: Tensor) -> Case:
+def _case(
+    eye: Observer,
+    colour: int,
+    wavelength: float,
+    holograms: list[Tensor],
+    reference: Tensor,
+    similarity: Callable[[Tensor, Tensor], Tensor] | None,
+) -> Case:
     """Measurements of holograms [C, H, W] against a reference [h, w]."""
     depth = eye.focus[0]
     wavelengths = wavelength + np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
@@ -128,6 +147,9 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
     tone = tone_map(pictures[..., None, :, :], peak=peak), tone_map(reference[None], peak=peak)
     quality = ssim(tone[0], tone[1].expand_as(tone[0]).contiguous(), data_range=1.0)[..., 0].mean(0)
     contrast = speckle_contrast(pictures, reference=reference, mask=reference > LIT * reference.max()).mean(0)
+    perceived = None
+    if similarity is not None:
+        perceived = tuple(similarity(tone[0], tone[1].expand_as(tone[0]).contiguous()).mean(0).tolist())
     best, inside = parabola_peak(np.log(WIDTHS).tolist(), quality.tolist())
     return Case(
         depth,
@@ -137,6 +159,7 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
         tuple(contrast.tolist()),
         float(np.exp(best)),
         inside,
+        perceived,
     )
 
 
@@ -187,7 +210,14 @@ def in_words(cases: list[Case]) -> list[str]:
         *(
             f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
             f"{case.best * 1e9:.1f} nm (from the other distances {expected[case] * 1e9:.1f}), nearest to a "
-            f"{case.source.replace('_', ' ')}"
+            f"{case.source.replace('_', ' ')}{_perceived(case)}"
             for case in cases
         ),
     ]
+
+
+def _perceived(case: Case) -> str:
+    if case.lpips is None:
+        return ""
+    best, inside = parabola_peak(np.log(WIDTHS).tolist(), case.lpips)
+    return f"; by LPIPS {'' if inside else 'beyond '}{1e9 * math.exp(best):.1f} nm"

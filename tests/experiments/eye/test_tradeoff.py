@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from holotorch.experiments.eye import tradeoff as eye_tradeoff
 from holotorch.experiments.eye.tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
@@ -53,12 +54,20 @@ def test_a_small_scene_has_its_cases(monkeypatch):
     assert looking is not None and shown is not None
     change = "hologram={shape: [128, 128], pitch: 3.74 um, distance: 12 mm, depths: 8, rays: 64}"
     scene = load_config(shown, [change, "volume={phantom: c60, samples: 24}"])
-    cases = tradeoff(load_config(looking), scene, (12e-3,), seeds=1, others=2)
+
+    def similarity(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        assert a.shape == b.shape == (1, len(WIDTHS), 1, 64, 64) and a.min() >= 0 and a.max() <= 1
+        return 1 - (a - b).abs().mean((-3, -2, -1))
+
+    cases = tradeoff(load_config(looking), scene, (12e-3,), seeds=1, others=2, similarity=similarity)
+    assert all("; by LPIPS " in line for line in in_words(cases)[1:])
     assert [found.wavelength for found in cases] == list(scene.wavelengths)
     for found in cases:
         assert len(found.ssim) == len(WIDTHS) and found.contrast[0] > found.contrast[-1]
         # 64 rays of 7.48 um: what they carry, or the sine to the edge of 128 pixels at 12 mm.
         edge = math.sin(math.atan2(64 * 3.74e-6, 12e-3))
         assert found.aperture == pytest.approx(min(edge, found.wavelength / 14.96e-6), rel=1e-6)
+        assert found.lpips is not None and found.lpips[0] < max(found.lpips)  # a laser's speckle is far from the mean
+        assert found.row(0.5)["lpips_1.4"] == round(found.lpips[0], 4)
         row = found.row(0.5)
         assert row["ssim_1.4"] == round(found.ssim[0], 4) and row["inside"] == found.inside
