@@ -18,8 +18,8 @@ CHARTS = {
     "camera": ("holotorch.experiments.camera.chart", "corrected"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
     "network": ("holotorch.experiments.network.chart", "training"),
-    "joint": ("holotorch.experiments.joint.chart", ""),
-    "chain": ("holotorch.experiments.joint.chain", ""),
+    "joint": ("holotorch.experiments.joint.charts.chart", ""),
+    "chain": ("holotorch.experiments.joint.charts.chain", ""),
     "tracking": ("holotorch.experiments.tracking_benchmark.chart", "grids"),
 }
 QUICK_FORM = "Quick form: smaller and fewer cases, no goal is tested"  # how the verdict of a quick chart begins

@@ -1,6 +1,7 @@
 """Download of those volumes of Table 5.2 of the thesis for which a checksum is published."""
 
 import difflib
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,5 +82,6 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     try:
         pooch.retrieve(entry.url, known_hash=f"sha512:{entry.sha512}", fname=file.name, path=folder)
     except OSError as error:  # includes the errors of the requests library
-        raise OSError(f"could not fetch {entry.url}: {error}; download it and put it at {file}") from error
+        reason = textwrap.shorten(str(error), 80, placeholder=" ...")
+        raise OSError(f"could not fetch {entry.url} ({reason}); download it and put it at {file}") from error
     return load_volume(file, spacing=1, unit="relative", shape=entry.shape, dtype=entry.dtype)

@@ -21,7 +21,7 @@ from holotorch.experiments.config.settings import (
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.volume.config import Depth, TransferSettings, ViewSettings, VolumeSource
 
-_REFERENCE = 630e-9  # metres, wavelength of ``display.rad_per_K``
+REFERENCE = 630e-9  # metres, wavelength of ``display.rad_per_K``
 PLANES = 5  # of a run without tolerance that states no number
 Baseline = Literal["random", "afterwards", "unheated", "retrieved", "retrieved_pec", "slabs"]
 
@@ -34,8 +34,8 @@ class DisplaySettings(GridSettings):
     its light; by default 5, or as many as the tolerance of the run needs (up to 64, with slabs one per frame).
     ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
     the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm). ``max_temperature``: in its place a
-    limit on the temperature of every pixel above ambient, such as 500 degC, which all colours share, see
-    :meth:`JointSettings.limit`. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
+    limit on the temperature of every pixel above ambient, such as 500 degC, which all colours
+    share in phase. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
     """
 
     distance: Depth
@@ -124,7 +124,7 @@ class JointSettings(Settings):
         display = self.display
         if display.max_temperature is None:
             return display.max_phase
-        return display.max_temperature * display.rad_per_K * _REFERENCE / max(self.wavelengths)
+        return display.max_temperature * display.rad_per_K * REFERENCE / max(self.wavelengths)
 
 
 def volume_settings(settings: JointSettings, planes: int | None = None) -> dict[str, Any]:
@@ -162,5 +162,6 @@ def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
     planes = display.planes or (PLANES if settings.tolerance is None else 1)
     if "slabs" in settings.report.baselines and settings.frames < planes:
         hint = f"slabs shows one plane a frame and needs at least {planes} frames, got {settings.frames}"
-        problems.append((("report", "baselines"), f"{hint}; leave it out"))
+        others = ", ".join(name for name in settings.report.baselines if name != "slabs")
+        problems.append((("report", "baselines"), f"{hint}; leave it out: 'report.baselines=[{others}]'"))
     return problems

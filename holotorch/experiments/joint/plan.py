@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from holotorch.experiments.joint.budget import PATIENCE, stop
-from holotorch.experiments.joint.config import JointSettings
+from holotorch.experiments.joint.config import REFERENCE, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.seconds import seconds_of, view_samples
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
@@ -60,7 +60,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; heat spreads over {display.sigma_px:g} px, phases up to "
-        f"{settings.limit / math.pi:.3g} pi{memory}",
+        f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient{memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",
         f"Solver     L-BFGS, {_steps(values, settings)}; compared with "
@@ -77,6 +77,12 @@ def _steps(values: dict[str, Any], settings: JointSettings) -> str:
         return f"{settings.steps} steps"
     few = f"{PATIENCE} in a row change the loss by less than {values['stop_below']:.1e} of it"
     return f"at most {settings.steps} steps, until {few}"
+
+
+def _temperatures(settings: JointSettings) -> str:
+    """Of the hottest pixel that the limit allows, for each wavelength."""
+    response = [settings.display.rad_per_K * REFERENCE / wavelength for wavelength in settings.wavelengths]
+    return " / ".join(f"{settings.limit / each:.0f}" for each in response)
 
 
 def _left(settings: JointSettings) -> float:

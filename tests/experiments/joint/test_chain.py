@@ -6,7 +6,7 @@ import torch
 from holotorch import Grid
 from holotorch.cli import main
 from holotorch.correction import PECProblem
-from holotorch.experiments.joint import chain
+from holotorch.experiments.joint.charts import chain
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import Display, Eye, Retina, RetinaViews
 

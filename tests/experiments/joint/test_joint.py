@@ -14,7 +14,7 @@ from tiny_runs import VOLUME, command
 from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
-from holotorch.experiments.joint import chart as joint_chart
+from holotorch.experiments.joint.charts import chart as joint_chart
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.evaluation import errors, evaluate
 from holotorch.experiments.joint.experiment import build

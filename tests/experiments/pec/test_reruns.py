@@ -7,7 +7,7 @@ import torch
 
 from holotorch.cli import main
 from holotorch.correction import Solution
-from holotorch.experiments.pec import reruns
+from holotorch.experiments.pec import run
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.experiment import build
 
@@ -37,8 +37,8 @@ def test_the_attempt_with_the_fewest_dark_spots_is_kept(monkeypatch, spots, kept
         return Solution(torch.full((1, 24, 24), float(number)), nothing, nothing, nothing, nothing, 1)
 
     monkeypatch.setattr(type(experiment), "solve", solve)
-    monkeypatch.setattr(reruns, "_total", lambda _, each: spots[int(each.x[0, 0, 0])])
-    best, _, counted = reruns.rerun(experiment, solution(0), 0.0)
+    monkeypatch.setattr(run, "_dark_spots", lambda _, each: spots[int(each.x[0, 0, 0])])
+    best, _, counted = run.rerun(experiment, solution(0), 0.0)
     assert best.x[0, 0, 0] == kept
     assert list(counted) == spots[:attempts] and solved == list(range(1, attempts))
 

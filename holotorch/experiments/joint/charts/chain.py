@@ -17,7 +17,7 @@ from holotorch.core.fourier import convolve
 from holotorch.correction import LBFGS, PECProblem, Solution, deconvolve, limit_peak_phase, spread_preconditioner
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
-from holotorch.experiments.joint.chart import volume_file
+from holotorch.experiments.joint.charts.chart import volume_file
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs.figures import picture_table
 from holotorch.experiments.runs.memory import peak_memory

@@ -1,0 +1,1 @@
+"""Charts of joint correction: its methods beside each other, and the whole chain to the retina."""
