@@ -149,7 +149,9 @@ def _score(numbers: dict[str, Any]) -> str:
 def rerun(experiment: PECExperiment, first: Solution, seconds: float) -> tuple[Solution, float, Sequence[int]]:
     """Solve again from other random phases while the best solution has dark spots, ``solver.reruns`` times at most.
 
-    Source: thesis Sec. 4.4.5.2. Returns the solution with the fewest dark spots, the seconds of all, and the dark spots of each attempt.
+    Returns the solution with the fewest dark spots, the seconds of all, and the dark spots of each attempt.
+
+    Source: thesis Sec. 4.4.5.2.
     """
     best, spots = first, [_dark_spots(experiment, first)]
     for attempt in range(1, experiment.settings.solver.reruns + 1):
