@@ -94,19 +94,19 @@ def in_words(values: dict[str, Any]) -> list[str]:
 
 
 def warnings(values: dict[str, Any]) -> list[str]:
-    """What spoils the pictures, from the result of :func:`geometry`."""
-    found = []
+    """What spoils the pictures, from the result of :func:`geometry`; a sentence for each."""
+    lines = []
     if min(values["light_of_edge"]) < _INVISIBLE:
-        found.append(
+        lines.append(
             "the edge of the scene is invisible to this eye; enlarge eye.pupil_radius or narrow the scene "
             "(view.width of its configuration)"
         )
     if (least := min(values["light_in_pupil"])) < _LITTLE:
-        found.append(
+        lines.append(
             f"only {100 * least:.2g} % of the light of the scene's centre enters the pupil: pictures are dim; enlarge "
             "eye.pupil_radius, or move eye or lens"
         )
-    return found
+    return lines
 
 
 def _accommodation_mm(eye: Observer, depth: float) -> float | None:

@@ -144,8 +144,8 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     if settings.tradeoff:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  in addition, at {where} mm, by collapsed propagation; the cost above excludes it")
-    told = len(eye_geometry.warnings(values["geometry"]))  # beside the numbers of the geometry, above
-    return "\n".join([*lines, *(f"WARNING    {words}" for words in values["warnings"][told:])])
+    first = len(eye_geometry.warnings(values["geometry"]))  # beside the numbers of the geometry, above
+    return "\n".join([*lines, *(f"WARNING    {words}" for words in values["warnings"][first:])])
 
 
 def too_large(values: dict[str, Any]) -> str | None:

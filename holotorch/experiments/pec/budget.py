@@ -9,9 +9,9 @@ from holotorch.experiments.planning import correction
 from holotorch.experiments.planning.correction import HEAT, PROPAGATION, STOPPING, HeaterPhases
 from holotorch.experiments.planning.tolerance import Budget, Part
 from holotorch.modulator import ThermalCrosstalk
+from holotorch.modulator.phased_array import REFERENCE_WAVELENGTH
 
 _STOP = {"apg": 1e-3, "adam": 1e-3, "lbfgs": 1e-4}  # relative change of the loss at which runs without tolerance stop
-_REFERENCE = 630e-9  # metres, wavelength of ``modulator.rad_per_K``
 
 
 def pec_budget(settings: PECSettings, start: str) -> Budget:
@@ -78,7 +78,7 @@ def _heaters(settings: PECSettings, start: str) -> HeaterPhases:
     if chip.max_phase is not None:
         limit = chip.max_phase
     elif chip.max_temperature is not None:
-        limit = chip.max_temperature * chip.rad_per_K * _REFERENCE / max(settings.wavelengths)
+        limit = chip.max_temperature * chip.rad_per_K * REFERENCE_WAVELENGTH / max(settings.wavelengths)
     # Corrected phases have means of 3.3 to 4.1 rad and deviations of 2.1 to 2.8 from a hot start, others less.
     mean, deviation = (4.0, 2.5) if start == "hot" else (1.0, 1.2)
     if start == "quadratic":
