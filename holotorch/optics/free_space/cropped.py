@@ -12,7 +12,7 @@ from holotorch.core.operator import Wavelengths
 from holotorch.optics.free_space.padding import FINEST, crop_length
 from holotorch.optics.free_space.plane_pair import PlanePair
 from holotorch.optics.free_space.propagators import DistanceFilter, checked_distance, checked_wavelengths
-from holotorch.optics.free_space.transfer import transfer_function
+from holotorch.optics.free_space.transfer import times_transfer_function, transfer_function
 
 
 class CroppedKernel(DistanceFilter):
@@ -67,7 +67,10 @@ class CroppedKernel(DistanceFilter):
         padded = Grid((good_length(lengths[0]), good_length(lengths[1])), grid.pitch)
         value = distance if isinstance(distance, Tensor) else z
         transfer = partial(_transfer_function, planes, padded, paraxial)
-        super().__init__(grid, wavelengths, value, padded.shape, transfer, learnable=learnable)
+        times = partial(
+            times_transfer_function, planes=planes, padded=padded, sampled=(False, False), paraxial=paraxial
+        )
+        super().__init__(grid, wavelengths, value, padded.shape, transfer, times=times, learnable=learnable)
         self.offset = planes.offset
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
-from holotorch.core.fourier import centred_fft2, centred_ifft2, filter_spectrum
+from holotorch.core.fourier import centred_fft2, centred_ifft2, fft2, filter_spectrum, ifft2
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
@@ -79,6 +79,8 @@ class DistanceFilter(SpectralFilter):
         padded: Number of samples (y, x) of the transforms.
         transfer_function: Function from wavelengths [C] and distance, float64, and a dtype to the transfer function
             [C, *padded] with the factor exp(ikz).
+        times: Function from a spectrum [..., C, *padded], which it may overwrite, wavelengths and distance to the
+            product of the spectrum with the transfer function; used where they are learned, if it is cheaper.
         learnable: Make the distance a Parameter.
 
     Attributes:
@@ -99,11 +101,12 @@ class DistanceFilter(SpectralFilter):
         padded: tuple[int, int],
         transfer_function: Callable[[Tensor, Tensor, torch.dtype], Tensor],
         *,
+        times: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
         out_grid: Grid | None = None,
         learnable: bool = False,
     ):
         FieldOperator.__init__(self, grid, checked_wavelengths(wavelengths), out_grid)
-        self.padded, self._transfer_function = padded, transfer_function
+        self.padded, self._transfer_function, self._times = padded, transfer_function, times
         learned = self.hold("distance", distance, learnable=learnable)
         if isinstance(wavelengths, nn.Parameter):
             learned = self.hold("wavelength", wavelengths)
@@ -116,8 +119,21 @@ class DistanceFilter(SpectralFilter):
 
     def transfer_function(self, dtype: torch.dtype = torch.complex128) -> Tensor:
         """The transfer function for the present wavelengths and distance, complex [C, P, Q], with their gradients."""
+        return self._transfer_function(*self._lengths(), dtype)
+
+    def _lengths(self) -> tuple[Tensor, Tensor]:
         distance = torch.as_tensor(self.distance, dtype=torch.float64, device=self.wavelength.device)
-        return self._transfer_function(self.wavelength.reshape(-1), distance, dtype)
+        return self.wavelength.reshape(-1), distance
+
+    def _forward(self, field: Tensor) -> Tensor:
+        if not self.learned or self._times is None:
+            return super()._forward(field)
+        return ifft2(self._times(fft2(field, self.padded), *self._lengths()), self.out_grid.shape)
+
+    def _adjoint(self, field: Tensor) -> Tensor:
+        if not self.learned or self._times is None:
+            return super()._adjoint(field)
+        return ifft2(self._times(fft2(field, self.padded).conj(), *self._lengths()).conj(), self.grid.shape)
 
     def kernel_for(self, field: Tensor) -> Tensor:
         """The transfer function, complex [C, P, Q], in the dtype of ``field``."""

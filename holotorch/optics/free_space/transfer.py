@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from holotorch.core.fourier import multiply_even
+from holotorch.core.fourier import multiplied, multiply_even
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.impulse_response import (
     fresnel_taps,
@@ -18,7 +18,7 @@ from holotorch.optics.free_space.impulse_response import (
     tilted_turns,
 )
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, turns_phasor
-from holotorch.optics.free_space.learned_distance import has_closed_form, learned_transfer_function
+from holotorch.optics.free_space.learned_distance import has_closed_form, times_learned
 from holotorch.optics.free_space.plane_pair import PlanePair, shifts
 
 
@@ -49,23 +49,6 @@ def transfer_function(
     Returns:
         Shape [..., H, W], frequencies in FFT order.
     """
-    if tilt is None and has_closed_form(planes, wavelength, distance):
-        options = {"sampled": sampled, "paraxial": paraxial, "dtype": dtype}
-        by_autograd = partial(_transfer_function, planes, padded, **options)
-        return learned_transfer_function(padded, wavelength, distance, differentiable=by_autograd, **options)
-    return _transfer_function(planes, padded, wavelength, distance, sampled, paraxial, dtype, tilt)
-
-
-def _transfer_function(
-    planes: PlanePair,
-    padded: Grid,
-    wavelength: Tensor,
-    distance: Tensor,
-    sampled: tuple[bool, bool],
-    paraxial: bool,
-    dtype: torch.dtype,
-    tilt: Tensor | None = None,
-) -> Tensor:
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     tilted = any(planes.tilt)
     if tilt is None:
@@ -114,6 +97,28 @@ def _transfer_function(
         half = torch.cat([quadrant, quadrant[..., 1 : (width + 1) // 2].flip(-1)], -1)
         return kernel * torch.cat([half, half[..., 1 : (height + 1) // 2, :].flip(-2)], -2)
     return multiply_even(kernel, quadrant)
+
+
+def times_transfer_function(
+    spectrum: Tensor,
+    wavelength: Tensor,
+    distance: Tensor,
+    *,
+    planes: PlanePair,
+    padded: Grid,
+    sampled: tuple[bool, bool],
+    paraxial: bool,
+) -> Tensor:
+    """``spectrum`` [..., H, W] times :func:`transfer_function`, by its closed form if only one distance is learned.
+
+    Otherwise ``spectrum`` may be overwritten.
+    """
+    by_autograd = partial(transfer_function, planes, padded, sampled=sampled, paraxial=paraxial, dtype=spectrum.dtype)
+    if not has_closed_form(planes, wavelength, distance):
+        return multiplied(spectrum, by_autograd(wavelength, distance))
+    return times_learned(
+        spectrum, padded, wavelength, distance, sampled=sampled, paraxial=paraxial, differentiable=by_autograd
+    )
 
 
 def wide_transfer_function(

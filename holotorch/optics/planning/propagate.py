@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,11 +17,16 @@ from holotorch.core.operator import Wavelengths
 from holotorch.core.plan import Plan
 from holotorch.core.quantities import DISTANCE, WAVELENGTH, Quantity
 from holotorch.optics.free_space.kernels import carrier
+from holotorch.optics.free_space.learned_distance import has_closed_form
 from holotorch.optics.free_space.padding import FINEST
 from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 from holotorch.optics.free_space.propagators import DistanceFilter, checked_distance, checked_wavelengths
 from holotorch.optics.free_space.resampled import ResampledKernel, resample, resampling_factors
-from holotorch.optics.free_space.transfer import transfer_function, wide_transfer_function
+from holotorch.optics.free_space.transfer import (
+    times_transfer_function,
+    transfer_function,
+    wide_transfer_function,
+)
 from holotorch.optics.free_space.zoomed import ZoomedFilter, chirps, zoomed
 from holotorch.optics.planning.candidates import ZOOMED, Candidate, Method, candidates
 from holotorch.optics.planning.content import FieldContent, field_content
@@ -94,41 +100,90 @@ def propagate(
     the result on grids of s times the pitch, because scaling all lengths changes nothing.
     """
     norms = _checked_norms(field, grid)
-    wavelengths, distances = _float64(WAVELENGTH, wavelength, field), _float64(DISTANCE, distance, field)
-    checks.precise(wavelengths if isinstance(wavelength, Sequence) else wavelength, distance)
-    every_wavelength, every_distance = (each.detach().reshape(-1).tolist() for each in (wavelengths, distances))
-    planes = plane_pair(grid, out_grid, offset, tilt, every_wavelength)
-    if plan is None:
-        chosen = _chosen(
-            planes, every_wavelength, every_distance, field, tolerance,
-            band=band, spread=spread, margin=margin, measure=measure, learned=distances.requires_grad,
-        )  # fmt: skip
-        _accept(chosen, tolerance)
-        best = chosen.plain
+    call = grid, wavelength, distance, plan, tolerance, out_grid, offset, tilt, band, spread, margin
+    tensors = any(isinstance(each, Tensor) for each in (wavelength, distance, tilt))
+    if measure or tensors or torch.compiler.is_compiling():
+        job = _prepared(*call, field.dtype, field.device, example=field if measure else None)
     else:
-        chosen, best = None, _handed(plan, planes)
-    result = _propagate_by(best, planes, field, wavelengths, distances, tilt if isinstance(tilt, Tensor) else None)
-    if chosen is not None:
-        _warn_if_dim(chosen, tolerance, planes, norms, result, measured=measure)
+        try:
+            job = _remembered_job(*call, field.dtype, field.device)
+        except TypeError:  # a list, which cannot be remembered
+            job = _prepared(*call, field.dtype, field.device)
+    if job.chosen is not None:
+        _accept(job.chosen, tolerance)
+    result = _propagate_by(job, field, tilt if isinstance(tilt, Tensor) else None)
+    if job.chosen is not None:
+        _warn_if_dim(job.chosen, tolerance, job.planes, norms, result, measured=measure)
     return result
 
 
-def _propagate_by(
-    method: Method, planes: PlanePair, field: Tensor, wavelengths: Tensor, distances: Tensor, tilt: Tensor | None
-) -> Tensor:
-    """Propagate ``field`` by one method, with a remembered kernel where nothing carries a gradient."""
-    if method.method == "identity":
-        return field * carrier(wavelengths, distances)[..., None, None].to(field.dtype)
-    learned = wavelengths.requires_grad or distances.requires_grad or tilt is not None
+class _Job(NamedTuple):
+    """What a call of :func:`propagate` does with its field.
+
+    ``pairs`` are the wavelengths and distances of the kernels that are remembered; None if they are made anew.
+    ``chosen`` is None for a plan that was handed in.
+    """
+
+    planes: PlanePair
+    method: Method
+    chosen: Candidate | None
+    wavelengths: Tensor
+    distances: Tensor
+    pairs: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    leading: tuple[int, ...] = ()  # shape of the pairs
+
+
+def _prepared(
+    grid: Grid,
+    wavelength: Wavelengths,
+    distance: float | Tensor,
+    plan: Plan | None,
+    tolerance: float,
+    out_grid: Grid | None,
+    offset: tuple[float, float],
+    tilt: tuple[float, float] | Tensor,
+    band: tuple[float, float] | None,
+    spread: tuple[float, float] | None,
+    margin: tuple[float, float],
+    dtype: torch.dtype,
+    device: torch.device,
+    *,
+    example: Tensor | None = None,
+) -> _Job:
+    """Check the arguments of :func:`propagate` and choose a method; ``example`` is the field if it is measured."""
+    wavelengths, distances = _float64(WAVELENGTH, wavelength, device), _float64(DISTANCE, distance, device)
+    checks.precise(wavelengths if isinstance(wavelength, Sequence) else wavelength, distance)
+    every_wavelength, every_distance = (each.detach().reshape(-1).tolist() for each in (wavelengths, distances))
+    planes = plane_pair(grid, out_grid, offset, tilt, every_wavelength)
+    learned = wavelengths.requires_grad or distances.requires_grad or isinstance(tilt, Tensor)
+    if plan is None:
+        chosen = _chosen(
+            planes, every_wavelength, every_distance, dtype, tolerance,
+            band=band, spread=spread, margin=margin, example=example, learned=distances.requires_grad,
+        )  # fmt: skip
+        method = chosen.plain
+    else:
+        chosen, method = None, _handed(plan, planes)
     if learned or not planes.same_pitch or not _rememberable(method, wavelengths, distances):
+        return _Job(planes, method, chosen, wavelengths, distances)
+    both = torch.broadcast_tensors(wavelengths.detach(), distances.detach())
+    first, second = (tuple(each.reshape(-1).tolist()) for each in both)
+    return _Job(planes, method, chosen, wavelengths, distances, (first, second), both[0].shape)
+
+
+_remembered_job = lru_cache(maxsize=64)(_prepared)  # for calls with numbers only; tensors may change their values
+
+
+def _propagate_by(job: _Job, field: Tensor, tilt: Tensor | None) -> Tensor:
+    """Propagate ``field`` by one method, with a remembered kernel where nothing carries a gradient."""
+    planes, method = job.planes, job.method
+    if method.method == "identity":
+        return field * carrier(job.wavelengths, job.distances)[..., None, None].to(field.dtype)
+    if job.pairs is None:
         tilt = None if tilt is None else tilt.to(field.device, torch.float64)
-        return _propagate_anew(method, planes, field, wavelengths, distances, tilt)
-    pairs = [wavelengths.detach(), distances.detach()]
-    if wavelengths.ndim or distances.ndim:
-        pairs = torch.broadcast_tensors(*pairs)
-    numbers = [tuple(each.reshape(-1).tolist()) for each in pairs]
-    kernel = _constant_kernel(planes, method, *numbers, field.dtype, field.device)
-    return filter_spectrum(field, kernel.reshape(*pairs[0].shape, *kernel.shape[-2:]), planes.out.shape)
+        return _propagate_anew(method, planes, field, job.wavelengths, job.distances, tilt)
+    kernel = _constant_kernel(planes, method, *job.pairs, field.dtype, field.device)
+    return filter_spectrum(field, kernel.reshape(*job.leading, *kernel.shape[-2:]), planes.out.shape)
 
 
 def _propagate_anew(
@@ -137,10 +192,14 @@ def _propagate_anew(
     """Propagate ``field`` by one method, with a new kernel for each wavelength and distance in turn."""
 
     def filtered(spectrum: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
-        kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
-        # Several distances share the spectrum; for a single one its memory is reused.
-        single = wavelengths.numel() * distances.numel() == 1
-        return ifft2(multiplied(spectrum, kernel) if single else spectrum * kernel, planes.out.shape)
+        if tilt is None and candidate.method != "identity" and has_closed_form(planes, wavelength, distance):
+            product = _times_kernel(spectrum, wavelength, distance, planes=planes, method=candidate)
+        else:
+            kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
+            # Several distances share the spectrum; for a single one its memory is reused.
+            single = wavelengths.numel() * distances.numel() == 1
+            product = multiplied(spectrum, kernel) if single else spectrum * kernel
+        return ifft2(product, planes.out.shape)
 
     def zoomed_in(field: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
         kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
@@ -164,6 +223,8 @@ def _one_by_one(
     field: Tensor, wavelengths: Tensor, distances: Tensor, shape: tuple[int, int], apply: Callable[..., Tensor]
 ) -> Tensor:
     """``apply(field, wavelength, distance)`` for each pair in turn, since all kernels together need too much memory."""
+    if wavelengths.ndim == distances.ndim == 0:
+        return apply(field, wavelengths, distances)
     wavelengths, distances = torch.broadcast_tensors(wavelengths, distances)
     batch = torch.broadcast_shapes(wavelengths.shape, field.shape[:-2])
     if wavelengths.numel() == 1:
@@ -225,10 +286,11 @@ class Propagator(nn.Module):
         best, _ = choose(options, tolerance)
         _accept(best, tolerance)
         if planes.same_pitch:
-            transfer = partial(_transfer_function, planes, best.plain)
             self.operator = DistanceFilter(
-                grid, wavelengths, distance, best.padded, transfer, out_grid=planes.out, learnable=learnable
-            )
+                grid, wavelengths, distance, best.padded, partial(_transfer_function, planes, best.plain),
+                times=partial(_times_kernel, planes=planes, method=best.plain),
+                out_grid=planes.out, learnable=learnable,
+            )  # fmt: skip
             return
         if learnable or isinstance(distance, nn.Parameter) or isinstance(wavelengths, nn.Parameter):
             raise ValueError(
@@ -267,22 +329,21 @@ def _chosen(
     planes: PlanePair,
     wavelengths: list[float],
     distances: list[float],
-    field: Tensor,
+    dtype: torch.dtype,
     tolerance: float,
     *,
-    measure: bool,
+    example: Tensor | None,
     learned: bool,
     **described: tuple[float, float] | None,
 ) -> Candidate:
-    """The best candidate for the light that ``described`` (band, spread and margin) or, if measured, ``field`` is."""
+    """The best candidate for the light that ``example`` is, or that band, spread and margin describe without one."""
     checks.positive("tolerance", tolerance)
     if learned and planes.straight:  # the error of such a method grows with the distance
         distances = [next_longer(each) for each in distances]
-    example = field if measure else None
     content = field_content(planes.grid, wavelengths, distances, field=example, **described)  # type: ignore[arg-type]
-    if measure:
-        return choose(candidates(planes, wavelengths, distances, content, field.dtype), tolerance)[0]
-    return _cached_choice(planes, tuple(wavelengths), tuple(distances), content, field.dtype, tolerance)
+    if example is not None:
+        return choose(candidates(planes, wavelengths, distances, content, dtype), tolerance)[0]
+    return _cached_choice(planes, tuple(wavelengths), tuple(distances), content, dtype, tolerance)
 
 
 @lru_cache(maxsize=64)
@@ -397,6 +458,18 @@ def _transfer_function(
     return kernel_of(planes, candidate, wavelength, distance, dtype)
 
 
+def _times_kernel(
+    spectrum: Tensor, wavelength: Tensor, distance: Tensor, *, planes: PlanePair, method: Method
+) -> Tensor:
+    """``spectrum`` [..., H, W], which may be overwritten, times :func:`kernel_of`."""
+    if method.method == "identity" or not has_closed_form(planes, wavelength, distance):
+        return multiplied(spectrum, kernel_of(planes, method, wavelength, distance, spectrum.dtype))
+    padded, sampled, paraxial = Grid(method.padded, planes.grid.pitch), method.sampled, method.paraxial
+    return times_transfer_function(
+        spectrum, wavelength, distance, planes=planes, padded=padded, sampled=sampled, paraxial=paraxial
+    )
+
+
 def kernel_of(
     planes: PlanePair,
     candidate: Method,
@@ -421,20 +494,20 @@ def kernel_of(
     )
 
 
-def _float64(kind: Quantity, value: float | Sequence[float] | Tensor, field: Tensor) -> Tensor:
-    """``value`` as float64 tensor on the device of ``field``, checked to be a plausible quantity of this kind."""
-    if not isinstance(value, Tensor):
-        if torch.compiler.is_compiling() or not isinstance(value, float):
-            return _constant.__wrapped__(kind, value, field.device)
-        return _constant(kind, value, field.device)
-    value = value.to(field.device, torch.float64)
-    checks.quantities(kind, value)
-    return value
+def _float64(kind: Quantity, value: float | Sequence[float] | Tensor, device: torch.device) -> Tensor:
+    """``value`` as float64 tensor on ``device``, checked to be a plausible quantity of this kind."""
+    if isinstance(value, float) and not torch.compiler.is_compiling():
+        return _constant(kind, value, device)
+    if isinstance(value, Tensor):
+        value = value.to(device, torch.float64)
+        checks.quantities(kind, value)
+        return value
+    return _constant.__wrapped__(kind, value, device)
 
 
 @lru_cache(maxsize=64)
 def _constant(kind: Quantity, value: float | Sequence[float], device: torch.device) -> Tensor:
-    """Checked numbers as float64 tensor, which is remembered because making it takes longer than all other checks."""
+    """Checked numbers as float64 tensor; remembered for learned distances, since making it takes 10 us."""
     each = value if isinstance(value, Sequence) else [value]
     numbers = [checks.quantity(kind, number) for number in each]
     with torch.inference_mode(False):  # a later call may need gradients

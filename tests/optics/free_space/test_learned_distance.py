@@ -1,5 +1,7 @@
 """The closed form of a learned distance against autograd of the same transfer function, and where it gives way."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch.autograd import forward_ad
@@ -22,8 +24,11 @@ def by_both(grid, shape, distance, **options):
     planes, padded = PlanePair(grid, grid), Grid(shape, grid.pitch)
     z = torch.tensor(distance, dtype=torch.float64, requires_grad=True)
     assert has_closed_form(planes, WAVELENGTHS, z)
-    closed = transfer.transfer_function(planes, padded, WAVELENGTHS, z, **options)
-    return z, closed, transfer._transfer_function(planes, padded, WAVELENGTHS, z, **options)
+    by_autograd = partial(transfer.transfer_function, planes, padded, WAVELENGTHS, z)
+    dtype = options.pop("dtype")
+    spectrum = torch.ones(shape, dtype=dtype, requires_grad=True)
+    closed = transfer.times_transfer_function(spectrum, WAVELENGTHS, z, planes=planes, padded=padded, **options)
+    return z, closed, by_autograd(**options, dtype=dtype)
 
 
 @pytest.mark.parametrize("distance", [3e-4, -3e-3, 0.05])
@@ -70,3 +75,20 @@ def test_the_closed_form_gives_way_where_it_loses_digits_or_does_not_apply():
         assert not has_closed_form(planes, WAVELENGTHS, z)
     with forward_ad.dual_level():
         assert not has_closed_form(planes, WAVELENGTHS, forward_ad.make_dual(z, torch.ones_like(z)))
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (3, 2), (3, 1)])
+def test_the_spectrum_gets_the_gradient_of_a_product(batch):
+    """Also where it broadcasts against the wavelengths, and for the adjoint, whose spectrum is conjugate."""
+    grid, shape = CASES[0]
+    planes, padded = PlanePair(grid, grid), Grid(shape, grid.pitch)
+    z = torch.tensor(3e-4, dtype=torch.float64, requires_grad=True)
+    options = {"sampled": (True, False), "paraxial": False}
+    spectrum = torch.randn(*batch, *shape, dtype=torch.complex128, requires_grad=True)
+    for given in (spectrum, spectrum.conj()):
+        closed = transfer.times_transfer_function(given, WAVELENGTHS, z, planes=planes, padded=padded, **options)
+        wanted = given * transfer.transfer_function(planes, padded, WAVELENGTHS, z, **options)
+        torch.testing.assert_close(closed, wanted, rtol=0, atol=1e-9)
+        weight = torch.randn_like(wanted)
+        slopes, expected = (torch.autograd.grad(each, (spectrum, z), weight) for each in (closed, wanted))
+        torch.testing.assert_close(slopes, expected, rtol=1e-9, atol=1e-9)

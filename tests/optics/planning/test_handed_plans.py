@@ -46,8 +46,8 @@ def test_several_wavelengths_in_any_form_equal_a_propagator():
 
 
 def test_plans_and_kernels_are_remembered_and_do_not_mix():
-    planned._cached_choice.cache_clear()
-    planned._constant_kernel.cache_clear()
+    for cache in (planned._remembered_job, planned._cached_choice, planned._constant_kernel):
+        cache.cache_clear()
     light = field()
     first = propagate(light, GRID, 530e-9, 5e-3)
     for _ in range(3):
