@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -183,15 +184,17 @@ def _draw_regions(axes: Any, eye: Observer) -> None:
     apex = viewing.region_apex(width, pitch, wavelength)
     deep = 1.15 * max(2 * apex, max(scene.depths))
     high = 1.1 * max(width, scene.width)
-    z, y = np.linspace(1e-4 * deep, deep, 300), np.linspace(-high, high, 241)
-    kinds = [[viewing.region(height, distance, width, pitch, wavelength) for distance in z] for height in y]
-    mesh = axes.pcolormesh(1e3 * z, 1e3 * y, kinds, cmap="Blues", vmin=0, vmax=4, shading="nearest")
+    # The half width of a cone grows with distance, by half the hologram's width up to the apex.
+    z = 1e3 * np.array([0, apex, deep])
+    cone, half = z / (1e3 * apex) * 1e3 * width / 2, 1e3 * width / 2
+    for edge, kind in ((half + cone, 2), (np.maximum(half - cone, 0), 1), (np.maximum(cone - half, 0), 3)):
+        axes.fill_between(z, -edge, edge, color=colormaps["Blues"](kind / 4), linewidth=0)
     for name, distance, height in (("I", 0.5 * apex, 0.0), ("II", apex, width / 2), ("III", 1.6 * apex, 0.0)):
         axes.text(1e3 * distance, 1e3 * height, name, ha="center", va="center")
-    mesh.set_rasterized(True)
     axes.plot([0, 0], [-1e3 * width / 2, 1e3 * width / 2], "k", linewidth=4)
     _draw_scene(axes, eye)
     axes.set(xlabel="distance from the hologram (mm)", ylabel="height (mm)")
+    axes.set(xlim=(0, 1e3 * deep), ylim=(-1e3 * high, 1e3 * high))
     axes.set_title(f"regions of a point at {1e9 * wavelength:.0f} nm, and the scene", fontsize=10)
 
 
