@@ -29,7 +29,7 @@ RUNS: dict[str, list[str]] = {
         "display={shape: [24, 20], pitch: 9 um, distance: 2 mm, depth: 2 mm, planes: 2}",
         *("eye.parallax=2", "report.baselines=[afterwards, slabs]"),
     ],
-    "study": ["pec/studies/lowpass.yaml", "images=[camera]", "size=24", "max_steps=4", "sweep=[0.1,0.2]"],
+    "study": ["pec/studies/limits.yaml", "images=[camera]", "size=24", "max_steps=4", "sweep=[0.5,0.6]"],
     "measure": ["tracking/measure.yaml", "grid.rows=3", "grid.columns=2"],
     "layout": ["perception/layout.yaml", ITEMS],
     "analysis": [

@@ -8,6 +8,16 @@ from holotorch.experiments.tracking.devices import save_camera, save_catheter
 from holotorch.tracking import THESIS
 
 
+class Blank:
+    """A canvas that draws nothing."""
+
+    def __init__(self, figure):
+        pass
+
+    def print_png(self, buffer):
+        """Leave the picture empty."""
+
+
 @pytest.fixture(scope="module")
 def tiny():
     """For tiny runs: no figures, which take longer than they do, and one thread, as two would wait for each other."""
@@ -16,6 +26,7 @@ def tiny():
     with pytest.MonkeyPatch.context() as patch:
         for name in ("comparison", "channel_maps", "convergence", "picture_table", "visual_field"):
             patch.setattr(figures, name, lambda *_, **__: b"")
+        patch.setattr(figures, "FigureCanvasAgg", Blank)
         yield
     torch.set_num_threads(threads)
 

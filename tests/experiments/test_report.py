@@ -87,7 +87,7 @@ def test_runs_of_all_kinds_share_a_page(folders, tmp_path, capsys, tiny):
     every = [*map(str, folders), *(str(tmp_path / name) for name in names)]
     assert main(["report", *every, "--out", str(tmp_path / "all.html")]) == 0
     page = (tmp_path / "all.html").read_text()
-    assert all(words in page for words in ("<h1>Runs</h1>", "study: lowpass", "<h1>layout</h1>", "<h1>analysis</h1>"))
+    assert all(words in page for words in ("<h1>Runs</h1>", "study: limits", "<h1>layout</h1>", "<h1>analysis</h1>"))
     assert page.count("<style>") == page.count("<!DOCTYPE html>") == 1
 
 
