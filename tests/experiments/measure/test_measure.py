@@ -19,6 +19,8 @@ from holotorch.experiments.measure.source import Source, open_source
 from holotorch.io.video import Frame, Frames
 from holotorch.tracking import Camera
 
+pytestmark = pytest.mark.usefixtures("tiny")
+
 
 def test_a_catheter_at_rest(tmp_path, capsys):
     """For white noise, S_RMS is sqrt(2) times sd; a drift of 2 mm raises sd alone, and is said."""

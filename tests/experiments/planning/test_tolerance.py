@@ -10,6 +10,8 @@ from holotorch.cli import main
 from holotorch.experiments.planning.errors import Comparison, error_sentence, error_values, not_measured
 from holotorch.experiments.planning.tolerance import Budget, Part
 
+pytestmark = pytest.mark.usefixtures("tiny")
+
 
 def test_parts_share_a_tolerance_in_squares():
     budget = Budget(0.1, [Part("one", 1), Part("two", 1), Part("three", 1)])
