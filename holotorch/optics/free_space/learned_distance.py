@@ -26,7 +26,7 @@ Differentiable = Callable[[Tensor, Tensor], Tensor]  # from wavelength and dista
 
 
 def has_closed_form(planes: PlanePair, wavelength: Tensor, distance: Tensor) -> bool:
-    """Whether :func:`learned_transfer_function` applies: only one distance is learned, between planes that face.
+    """Whether :func:`learned_transfer_function` applies: one learned distance, and equal samples on both planes.
 
     Forward mode, transforms of ``torch.func``, ``torch.compile`` and GPUs, where the checks of values would be slow or
     impossible, are left to autograd.

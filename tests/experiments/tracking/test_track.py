@@ -222,7 +222,7 @@ def test_a_rough_calibration_is_noted(tmp_path, tracker):
         evidence["deviations"] = {"fx": share * settings["fx"], "fy": share * settings["fx"]}
         path.write_text(yaml.safe_dump(settings | {"calibration": evidence}))
         folder, _ = tracked(tmp_path, source, name, video=False)
-        assert any("leaves its focal length open to 15.0 %" in note for note in summary(folder)["notes"]) == told
+        assert any("determines its focal length only to 15.0 %" in note for note in summary(folder)["notes"]) == told
 
 
 def test_a_recording_that_does_not_fit_is_refused(tmp_path, tracker, monkeypatch):
