@@ -136,5 +136,5 @@ def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:
     if unsure > SURE:
         frames.notes.append(
             f"the camera's calibration determines its focal length only to {100 * unsure:.1f} %: tips are as far off "
-            "along the line of sight, in all frames alike, and no deviation below says so"
+            "along the line of sight, in all frames alike, which the deviations below exclude"
         )

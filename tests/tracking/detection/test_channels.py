@@ -141,7 +141,7 @@ def test_a_mirrored_frame_is_a_possible_frame_of_any_straight_tube():
 
 def test_who_has_not_stated_the_order_is_warned_once():
     with pytest.warns(
-        ChannelOrderWarning, match=r"order BGR show .* as another pose.*channels=ChannelOrder.RGB"
+        ChannelOrderWarning, match=r"order BGR show .* in another pose.*channels=ChannelOrder.RGB"
     ) as seen:
         tracker = CatheterTracker(WORLD.camera, THESIS)
     assert len(seen) == 1 and seen[0].filename == __file__
