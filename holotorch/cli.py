@@ -41,8 +41,8 @@ def main(arguments: list[str] | None = None) -> int:
         explanation = str(error) if isinstance(error, MemoryError) else ""
         print(explanation or "out of memory; use a smaller grid", file=sys.stderr)
         return FAILED
-    except BrokenPipeError:  # the reader has left, as ``head`` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that Python does not fail at its end
+    except BrokenPipeError:  # the reader has closed the pipe, as ``head`` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that Python does not fail at exit
         return FAILED
     except ConnectionError as error:
         print(error, file=sys.stderr)
@@ -144,7 +144,7 @@ def _report(options: argparse.Namespace) -> int:
 def _chart(options: argparse.Namespace) -> int:
     from holotorch.experiments.chart import chart
 
-    # The committed charts are of the full form, so that a quick one has another place.
+    # The committed charts are full ones; a quick chart is written to another folder.
     charts = Path("runs/charts-quick" if options.quick else "scripts/charts")
     if options.subject == "all":
         return _chart_all(options.out or charts, options.quick)
@@ -238,10 +238,10 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("folders", nargs="+", type=Path, metavar="DIR")
     report.add_argument("--out", type=Path, help="file to write (default: DIR/report.html; ./report.html for several)")
 
-    chart = command("chart", _chart, "speed against accuracy of every method, drawn and tabled")
+    chart = command("chart", _chart, "speed against accuracy of every method, as a figure and a table")
     subjects = "camera, chain, eye, joint, network, pec, propagation, stability, tracking, volume"
     chart.add_argument("subject", help=f"what to chart: {subjects}, or all, on one page")
-    chart.add_argument("--quick", action="store_true", help="a reduced form of seconds, which tests no goal")
+    chart.add_argument("--quick", action="store_true", help="a reduced form, which takes seconds and tests no goal")
     places = "scripts/charts/SUBJECT, with --quick runs/charts-quick/SUBJECT; of all: without SUBJECT"
     chart.add_argument("--out", type=Path, help=f"folder for the chart (default: {places})")
 
@@ -266,7 +266,7 @@ def _parser() -> argparse.ArgumentParser:
     add_stream(commands)
     add_study(commands)
     add_view(commands)
-    command("doctor", _doctor, "check the installation and print what repairs it")
+    command("doctor", _doctor, "check the installation and print how to repair it")
     return parser
 
 

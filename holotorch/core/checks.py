@@ -26,7 +26,7 @@ class PrecisionWarning(UserWarning):
 
 
 class CostWarning(UserWarning):
-    """A result is many times as expensive as one with a somewhat larger error; the message says what accepts that."""
+    """A result is many times as expensive as one with a somewhat larger error; the message says how to accept it."""
 
 
 def positive(name: str, value: float, unit: str = "") -> float:

@@ -110,6 +110,6 @@ def without_graph(name: str, value: object) -> None:
 
 
 def fixed(name: str, value: object, instead: str) -> None:
-    """Raise ValueError if a gradient is asked of ``value``, a tensor; ``instead`` says what to do."""
+    """Raise ValueError if ``value`` is a tensor that requires a gradient; ``instead`` says what to do."""
     if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
         raise ValueError(f"{name} requires a gradient, which would be lost here: {instead}")

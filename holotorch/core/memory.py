@@ -8,7 +8,7 @@ import torch
 
 
 def available_memory(device: torch.device | str = "cpu") -> int | None:
-    """Bytes that can be allocated on ``device`` without swapping, or None if the system does not tell.
+    """Bytes that can be allocated on ``device`` without swapping, or None if the system does not state it.
 
     On Linux this is MemAvailable, or what is left of the limit of a container if that is less. Elsewhere it is the
     physical memory of the machine, an upper bound.

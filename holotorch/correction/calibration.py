@@ -52,7 +52,7 @@ def calibrate(
     Args:
         model: From patterns to intensities, for instance heater phases to the image of a phased array.
         patterns: Such as a handful of random phases, [N, C, H, W].
-        images: What the camera sees of each, real, shaped as the result of the model.
+        images: Images by the camera, one for each pattern, real, shaped as the result of the model.
         units: For some parameters by name, a change that matters, such as 1e-5 m of a distance; 1 % of its largest
             value by default.
         max_steps: Largest number of steps.
@@ -110,8 +110,10 @@ def calibrate(
 def scan(model: nn.Module, name: str, values: Tensor, patterns: Tensor, images: Tensor) -> Tensor:
     """Set a parameter to that of ``values`` [K] whose images fit best; returns the losses [K].
 
-    Speckles differ from those at a distance that is wrong by more than about wavelength / NA^2, where a gradient no
-    longer leads to the right one. Raises ValueError for a name that is no parameter, and as :func:`calibrate`.
+    Use it before :func:`calibrate` for a distance with an error above about wavelength / NA^2: speckles are then
+    unrelated to those in the images, and gradients do not lead to the right distance.
+
+    Raises ValueError for a name that is no parameter, and as :func:`calibrate`.
     """
     parameters = dict(model.named_parameters())
     if name not in parameters:

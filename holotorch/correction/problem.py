@@ -38,8 +38,8 @@ class PECProblem(nn.Module):
         power_weight: Weight >= 0 of the sum of X, which is proportional to the heating power and is added to the loss.
         smoothness_weight: Weight >= 0 of the sum of squared differences of X between neighbours, added to the loss.
         light_weight: Weight >= 0 of the fraction of the emitted light that misses the image, times the sum of the
-            target. Of several images, such as those at several foci, the mean counts. The fraction is that of images
-            with the pixels of the array, as all propagators of one pitch give.
+            target. For several images, such as those at several foci, it is the mean. The images must have the pixel
+            size of the array, as those of propagators with a single pitch have.
         laser: With ``frames``, the relative power >= 0 of the laser in each frame and colour, [F, C], 1 by default;
             U is the mean of the intensities times these powers. An ``nn.Parameter`` is learned by an optimiser of
             parameters; the solvers keep it.

@@ -76,7 +76,7 @@ class Solution:
 
 
 class Run:
-    """State of a solver at work: the unknown, the losses, which items are still active, and the evaluations so far."""
+    """State of a running solver: the unknown, the losses, which items are still active, and the evaluations so far."""
 
     def __init__(
         self, solver: "Solver", objective: Objective, start: Tensor, project: Projection, resume: State | None
@@ -108,7 +108,7 @@ class Run:
         self.steps = torch.zeros_like(loss, dtype=torch.int64)
         self.calm = torch.zeros_like(self.steps)  # steps in a row whose change of loss was within the tolerance
         self.stalled = torch.zeros_like(self.active)
-        self.going: bool | None = None  # whether any item is active, where a step has read that already
+        self.going: bool | None = None  # whether any item is active, if a step has read this from the device
         self.resumed: State = {}
         if resume:
             self._restore(resume)
@@ -168,7 +168,7 @@ class Run:
         last, self.going = self.loss, going
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
-        self.x = torch.where(self.each(self.active), x, self.x)  # always, since asking first makes a GPU wait
+        self.x = torch.where(self.each(self.active), x, self.x)  # unconditional, since a test would wait for the GPU
         loss = torch.where(self.active, loss, last)
         self.calm = self._calm(loss)
         self.step += 1

@@ -19,7 +19,7 @@ _WAITING, _INTERRUPTED = "not drawn yet", "interrupted"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a subject: the lines of its verdict, or else the problem that it ended with."""
+    """Result of a subject: the lines of its verdict, or else the error that ended it."""
 
     seconds: float = 0.0
     verdict: Sequence[str] = ()
@@ -30,7 +30,7 @@ def chart_all(out: Path, *, quick: bool = False) -> dict[str, Outcome]:
     """Draw every chart into a folder of its own in ``out``, and the page ``index.html`` in ``out`` of all of them.
 
     A subject that fails is named on the page with its reason. The page is written again after every subject, so that
-    an interruption keeps what is drawn; the subjects after it have the problem that they are not drawn yet.
+    an interruption keeps what is drawn; the remaining subjects are reported as not drawn yet.
     """
     out.mkdir(parents=True, exist_ok=True)
     outcomes = dict.fromkeys(CHARTS, Outcome())
@@ -59,7 +59,7 @@ def _outcome(subject: str, folder: Path, quick: bool) -> Outcome:
         problem = _INTERRUPTED
     except ConfigError as error:
         problem = str(error)
-    except Exception as error:  # whatever a subject ends with, the others are drawn
+    except Exception as error:  # an error in one subject does not stop the others
         problem = f"{type(error).__name__}: {error}"
     return Outcome(time.perf_counter() - begin, problem=problem)
 

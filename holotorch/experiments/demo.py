@@ -37,6 +37,6 @@ def demo(out: Path | None, screenshot: Callable[[Path, Path], str]) -> tuple[Pat
         else:
             more["The catheter in a browser, as holotorch stream --view shows it"] = "tracking/view.png"
         more["Catheter tracking, in a synthetic recording"] = "tracking/report.html"
-        more["Icons over a wide field, as large as they must be"] = "layout/report.html"
+        more["Icons over a wide field, scaled for equal perception time"] = "layout/report.html"
     write_report(parts, folder / "report.html", more)
     return folder, complete

@@ -55,7 +55,7 @@ def check(settings: Any) -> RunPlan:
 
 
 def write_preview(settings: Any, path: Path) -> str:
-    """Write a picture of a run's inputs, and say what it shows. ConfigError for a kind without, or a path in use."""
+    """Write a picture of a run's inputs, and say what it shows. ConfigError for a kind without one, or a used path."""
     kind = find_kind(settings.experiment)
     if path.exists():
         raise ConfigError([f"{path} is there already; choose another --preview"])

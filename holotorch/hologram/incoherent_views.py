@@ -1,4 +1,4 @@
-"""The images that an eye sees of light sources at each focal distance, without any hologram: the targets of one."""
+"""Incoherent images of light sources at several focal distances, in closed form: targets for a hologram."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ def incoherent_views(layers: SourceLayers, wavelengths: Wavelengths, views: Sequ
     relative error of 1 / sqrt(N). Light of a point spreads over the directions of the pupil, so that a smaller pupil
     gives a darker image. The window has no edge here, as if the scene continued with black.
 
-    What the sources hide from each other is that of the direction in which they were rendered: the same for all views.
+    In all views, the sources occlude each other as in the direction in which they were rendered.
 
     Args:
         layers: Sources on planes; the pixels of the image are those of the sources.
@@ -31,8 +31,8 @@ def incoherent_views(layers: SourceLayers, wavelengths: Wavelengths, views: Sequ
         views: Focal distances and pupils.
 
     Returns:
-        In the dtype of the amplitudes, on their device. A pupil that is wider than half the band of the pixels is
-        sampled at the pixels.
+        In the dtype of the amplitudes, on their device. The image through a pupil that is wider than half
+        the band of the pixels is undersampled.
     """
     wavelengths = checks.wavelengths(wavelengths)
     if len(wavelengths) != layers.channels:

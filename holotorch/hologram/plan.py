@@ -206,9 +206,7 @@ def _notes(grid: Grid, wavelength: float, nearest: float, near: bool) -> tuple[s
     notes = []
     across = 2 * min(cone_samples(grid, wavelength, nearest))
     if across < 4:  # a narrower cone has too few samples to represent a spherical wave
-        notes.append(
-            f"the nearest plane's light covers {across:.2g} pixels: closer than that a point is a pixel, not a wave"
-        )
+        notes.append(f"a point on the nearest plane lights {across:.2g} pixels, too few to sample its spherical wave")
     if near:
         notes.append(
             "at this distance the light of each point may fill only part of the hologram; how its edge is defined "

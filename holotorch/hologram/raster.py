@@ -81,7 +81,7 @@ def strided_length(minimum: int, stride: int) -> int:
 def has_light(plane: Tensor) -> bool:
     """Whether any element differs from zero; NaN does. For speed, a few elements are tested before all of them.
 
-    Planes without values, which torch.compile and the meta device have, are taken for lit.
+    Planes without values, which torch.compile and the meta device have, count as lit.
     """
     if torch.compiler.is_compiling() or plane.is_meta:
         return True

@@ -87,7 +87,7 @@ def picture_matrix(wavelengths: Sequence[float]) -> Tensor:
     """Matrix [3, K] from intensities at K = 1, 2 or 3 wavelengths to the linear sRGB of a picture, float64.
 
     Equal intensities at three wavelengths are neutral grey, see :func:`white_balance`. Two wavelengths are shown in
-    their own colours, each as bright as sRGB holds it and mixed with grey as by ``optics.gamut_map``. A single one is
+    their own colours, each as bright as sRGB allows and mixed with grey as by ``optics.gamut_map``. A single one is
     shown in grey, whatever its colour.
 
     Raises:
@@ -101,7 +101,7 @@ def picture_matrix(wavelengths: Sequence[float]) -> Tensor:
         raise ValueError(f"expected 1, 2 or 3 wavelengths, got {len(wavelengths)}: a picture has three channels")
     columns = []
     for wavelength in wavelengths:
-        colour = srgb_matrix([wavelength])[:, 0]  # of luminance 1, as is grey [1, 1, 1]
+        colour = srgb_matrix([wavelength])[:, 0]  # of luminance 1, like grey [1, 1, 1]
         inside = 1 + (colour - 1) / (1 - colour.min().clamp(max=0))
         columns.append(inside / inside.max())
     return torch.stack(columns, 1).clamp(min=0)

@@ -13,7 +13,7 @@ from holotorch.core.precision import at_least_single
 
 _BAND = (0.05, 0.25)  # default band of sharpness, in cycles per sample; excludes the coarsest and finest detail
 _LAGS = 16  # lags per sample at which grain_size evaluates the autocorrelation
-_BRIGHT, _DARK = 0.25, 0.25  # of the mean of the reference, and of the reference at the pixel: see dark_spots
+_BRIGHT, _DARK = 0.25, 0.25  # fractions of the reference: of its mean, and of its value at the pixel; see dark_spots
 
 
 class Anisotropy(NamedTuple):
@@ -129,8 +129,8 @@ def dark_spots(intensity: Tensor, reference: Tensor) -> Tensor:
     """Number of pixels that should be bright and are dark, int64 [...] for intensities [..., H, W] of equal mean.
 
     A pixel counts where ``reference`` is above a quarter of its mean and ``intensity`` below a quarter of the
-    reference. Such a pixel is an optical vortex, a zero of the field that no small change of the phases removes: the
-    sign of speckle noise in a hologram whose phases began badly (thesis Sec. 4.4.5.2). ValueError for unequal (H, W).
+    reference. Such a pixel is an optical vortex, a zero of the field that no small change of the phases removes: a
+    sign of unfavourable initial phases of a hologram (thesis Sec. 4.4.5.2). ValueError for unequal (H, W).
     """
     intensity, reference = _picture("intensity", intensity), _picture("reference", reference)
     if intensity.shape[-2:] != reference.shape[-2:]:

@@ -15,7 +15,7 @@ from holotorch.core.precision import at_least_single
 from holotorch.core.quantities import SIGMA_PX
 
 _SMALLEST_TAP = 1e-12  # smaller taps are set to 0: products with them may be denormal numbers, which are slow
-_ROOM = 1.5  # ratio of the largest sigma that the taps of a learnable kernel have room for to the given one
+_ROOM = 1.5  # largest sigma for which a learnable kernel has enough taps, relative to the given one
 LOST_HEAT = 0.1  # share of heat outside a given number of taps that is too much; the thesis loses 8.7 % at sigma 2.5
 _TAPS_OF_FFT = 40  # taps per pixel, over both axes, above which FFTs are faster on a CPU (scripts/bench.py crosstalk)
 

@@ -1,4 +1,4 @@
-"""HeatCycle: the phases of frames that follow each other so fast that heat of earlier frames is left."""
+"""HeatCycle: the phases of frames that follow each other so fast that heat of earlier frames remains."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from holotorch.core.precision import at_least_single, without_autocast
 
 
 class HeatCycle(PreciseModule):
-    """Phases of a cycle of F frames that is repeated for ever, [..., F * M, C, H, W], from heater phases of F frames.
+    """Phases of a cycle of F frames that is repeated endlessly, [..., F * M, C, H, W], from heater phases of F frames.
 
     Heaters are constant during a frame. The phase of a pixel relaxes exponentially, with one time constant, towards the
     phase S_f = P(X_f) that the crosstalk P gives in the steady state:
@@ -24,7 +24,7 @@ class HeatCycle(PreciseModule):
     simulated. The operator is linear, and its weights are positive and sum to 1: a limit on the phases S_f also bounds
     T. Used in place of the crosstalk in ``PECProblem`` with ``frames``, it corrects the cycle as a whole.
 
-    One time constant for all patterns is a cautious model: where heat also flows sideways, fine patterns decay faster
+    A single time constant is a conservative model: where heat also flows sideways, fine patterns decay faster
     than coarse ones.
 
     Args:

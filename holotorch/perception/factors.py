@@ -44,7 +44,7 @@ def motion_term(speed_deg_s: Any, eccentricity_deg: Any) -> Tensor:
         ValueError: A speed is below 0, or an eccentricity outside 0 to 180 deg.
 
     Source: the power -2/3 is that of reaction times to the onset of motion up to 16 deg/s (Dzhafarov, Sekuler and
-    Allik, Perception & Psychophysics 54, 733 (1993)). The scale of the speed is linear in the eccentricity, as of
+    Allik, Perception & Psychophysics 54, 733 (1993)). The scale of the speed is linear in the eccentricity, as in
     McKee and Nakayama, Vision Research 24, 25 (1984): speeds are discriminated best from 5 deg/s in the fovea and
     from 30 deg/s at 40 deg, so that 1 + 40 / E2 = 6 and E2 = 8 deg. Assumed: 1 is added to v so that a pattern at rest
     has a finite time, since its appearance alone is perceived; the law extends beyond 40 deg; and motion shortens the

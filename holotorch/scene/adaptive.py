@@ -95,7 +95,7 @@ def adaptive_report(sampler: DVRSampler, volume: Volume, *, step: int = 4, contr
 
 
 class _Lattice:
-    """The coarse rays, the cells between them, and interpolation from the ones to the others."""
+    """The coarse rays, the cells between them, and interpolation from the coarse rays to all rays."""
 
     def __init__(self, shape: tuple[int, int], step: int, contrast: float, device: torch.device):
         step = checks.whole("step", step, 1)

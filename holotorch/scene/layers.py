@@ -1,4 +1,4 @@
-"""SourceLayers, point sources of light on planes, the interface between scene and hologram; SlabLayers before them."""
+"""SourceLayers, point sources of light on planes, the interface between scene and hologram; and SlabLayers."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -80,10 +80,10 @@ class SourceLayers:
 
 @dataclass(eq=False)
 class SlabLayers:
-    """Slabs of a volume before compositing, each on its plane: what they hide from each other depends on the direction.
+    """Slabs of a volume before compositing, one per plane, from which the light towards any direction follows.
 
-    Slabs are as thin as their planes here. Seen obliquely, a slab in front moves as a whole against one behind it, and
-    uncovers what it hides along the axis. The opacity of a slab, and its shading, are those along the axis.
+    Each slab is treated as infinitely thin: in an oblique view, a slab in front is shifted as a whole relative to one
+    behind it and covers other parts of it. The opacity of a slab, and its shading, are those along the axis.
 
     Attributes:
         grid: Positions of the sources, the same on every plane, centred on the axis; pitch in metres.

@@ -23,10 +23,10 @@ from holotorch.scene.volume import Volume
 
 PhaseMaps = Tensor | PointPhases
 _FEW_RAYS = 24  # rays along each axis that slab_error follows
-_FARTHEST = 1e-3  # metres between these rays at most
-_MOST_SLABS = 2048  # parts of slabs that it follows them through
+_FARTHEST = 1e-3  # largest distance between these rays in metres
+_MOST_SLABS = 2048  # largest number of parts of slabs along each of them
 _THICK = 4  # voxels: the error of thicker slabs is predicted in the first call, since it takes 0.1 to 1 s
-_COARSE = 0.25  # relative error of a rendering that is warned of
+_COARSE = 0.25  # relative error of a rendering above which a warning is given
 
 
 class DVRSampler(nn.Module):
@@ -209,7 +209,7 @@ class DVRSampler(nn.Module):
             if (error := self.slab_error(volume)) > _COARSE:
                 warnings.warn(
                     f"slabs are up to {march.thickest:.0f} voxels thick for a scene that varies within them: the "
-                    f"rendering is about {error:.0%} off the one with thin slabs; use more planes (slab_error tells)",
+                    f"rendering is about {error:.0%} off the one with thin slabs; use more planes (see slab_error)",
                     checks.SamplingWarning,
                     stacklevel=3,
                 )

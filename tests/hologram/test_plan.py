@@ -56,7 +56,7 @@ def test_what_no_way_reaches_is_refused():
 def test_borders_of_validity_are_said():
     cone = 2 * 30e-6 * math.tan(math.asin(WAVE / 2 / PITCH)) / PITCH
     close = plan_hologram(Grid(32, PITCH), WAVE, [30e-6], (32, 32))
-    assert f"covers {cone:.2g} pixels" in close.notes[0] and "how its edge is defined" in close.notes[1]
+    assert f"lights {cone:.2g} pixels" in close.notes[0] and "how its edge is defined" in close.notes[1]
     assert plan_hologram(Grid(32, PITCH), WAVE, [0.1], (32, 32)).notes == ()
     fine = plan_hologram(Grid(16, 0.2e-6), WAVE, [5e-6], (8, 8), cone="box")
     assert any("half a wavelength" in note for note in fine.notes)

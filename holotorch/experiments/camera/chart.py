@@ -64,7 +64,7 @@ def camera(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, bytes
 
 
 class Fault(nn.Module):
-    """What the model does not contain: light that falls off towards the corners, and a warped chip (astigmatism)."""
+    """Effects that the model lacks: light that falls off towards the corners, and a warped chip (astigmatism)."""
 
     def forward(self, field: Tensor) -> Tensor:
         """Field with the fault, complex [..., H, W]."""
@@ -87,7 +87,7 @@ def uncalibrated(learnable: bool = False) -> Chip:
 
 
 def captured(chip: Chip, noise: float, captures: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Random drives [N, 1, H, W] in rad and what the camera sees of them."""
+    """Random drives [N, 1, H, W] in rad and their images by the camera."""
     generator = torch.Generator().manual_seed(seed)
     drives = LIMIT * torch.rand(captures, 1, *GRID.shape, generator=generator, dtype=torch.float64)
     with torch.no_grad():

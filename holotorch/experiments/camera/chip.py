@@ -1,4 +1,4 @@
-"""A simulated chip in front of a camera, and the model that is to become like it."""
+"""A simulated chip in front of a camera, and the model that is fitted to it."""
 
 import math
 
@@ -25,7 +25,7 @@ class Chip(nn.Module):
         response: From drive to heat.
         sigma_px: Of the heat kernel.
         distance: To the camera in metres.
-        residual: Module from field to field that stands for what the other parts do not model; None for nothing.
+        residual: Module from field to field for effects that the other parts do not model; None for nothing.
         learnable: Whether response, sigma and distance are Parameters.
     """
 
@@ -75,8 +75,8 @@ class Chip(nn.Module):
 class FieldResidual(nn.Module):
     """A small network that multiplies a field by 1 plus a complex correction, which is 0 at first.
 
-    Its inputs are real and imaginary part of the field and the position on the grid, so that it can learn what depends
-    on the place, such as uneven illumination or a warped chip.
+    Its inputs are real and imaginary part of the field and the position on the grid, so that it can learn effects
+    that depend on the position, such as uneven illumination or a warped chip.
     """
 
     def __init__(self, grid: Grid, channels: int = 16):

@@ -15,7 +15,7 @@ from holotorch.experiments.config.meanings import MEANINGS
 from holotorch.experiments.config.settings import kelvin, metres, radians
 
 _LIMITS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
-# Names of the validators that read units, and of the quantities.
+# Quantity by the name of the validator that reads its unit.
 _QUANTITIES = {metres.__name__: "length", radians.__name__: "phase", kelvin.__name__: "temperature"}
 _UNITS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
 
@@ -24,7 +24,7 @@ class Key(NamedTuple):
     """One key of a kind of configuration."""
 
     name: str  # with dots, such as solver.max_steps
-    values: str  # what it may be, in words
+    values: str  # allowed values, in words
     default: str  # as YAML; "required", or "" for a section
     meaning: str
 
@@ -45,7 +45,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
 
 
 def _merged(alternatives: Sequence[list[Key]], sections: Sequence[type[BaseModel]]) -> Iterator[Key]:
-    """Keys of alternative sections, each once, with the kinds of section that have it if not all do."""
+    """Keys of alternative sections, each once; a key that not all of them have names the kinds that do."""
     if len(sections) == 1:
         yield from alternatives[0]
         return
@@ -95,7 +95,7 @@ def _is_list(annotation: Any) -> bool:
 
 
 def _quantity(parts: Sequence[Any]) -> str:
-    """Name of the quantity with units that an annotation, or one inside it, stands for; "" for a plain number."""
+    """Name of the quantity with a unit that an annotation, or one inside it, describes; "" for a plain number."""
     for part in parts:
         if isinstance(part, BeforeValidator) and (name := _QUANTITIES.get(getattr(part.func, "__name__", ""))):
             return name
@@ -105,7 +105,7 @@ def _quantity(parts: Sequence[Any]) -> str:
 
 
 def _values(annotation: Any, metadata: Sequence[Any], quantity: str) -> str:
-    """What a value may be, in words."""
+    """Allowed values, in words."""
     origin, inside = typing.get_origin(annotation), typing.get_args(annotation)
     limits = " and ".join(
         f"{sign} {getattr(each, name):g}" for each in _flat(metadata) for name, sign in _LIMITS if hasattr(each, name)

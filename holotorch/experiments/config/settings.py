@@ -141,7 +141,7 @@ Side = Annotated[Count, Field(le=16384)]
 class Settings(BaseModel):
     """Base of all sections: frozen, and an unknown key is an error.
 
-    ``elsewhere`` says where a key belongs that users may look for here.
+    ``elsewhere`` names the right place of keys that users may write here by mistake.
     """
 
     elsewhere: ClassVar[dict[str, str]] = {}

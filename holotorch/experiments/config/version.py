@@ -6,17 +6,17 @@ from pathlib import Path
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.source import Source
 
-# 1: no line; the tolerance of an eye run was that of the way to the retina alone.
-# 2: it is that of all parts together, and eye.tolerance that of the retina.
+# Version 1 has no version line; in an eye run, ``tolerance`` is for the propagation to the retina alone.
+# In version 2, ``tolerance`` is for all parts together, and ``eye.tolerance`` for the propagation to the retina.
 VERSION = 2
 FIRST_LINE = f"# holotorch configuration, version {VERSION}\n"
 _LINE = re.compile(r"# holotorch configuration, version (\d{1,6})\s*")
 
 
 def upgraded(source: Source) -> Source:
-    """A configuration in today's terms. ConfigError if a later holotorch has written it.
+    """A configuration with the keys of this version. ConfigError if a later holotorch has written it.
 
-    Only files with a version, and those of run folders without one, are touched: what a user writes means what it says.
+    Only files with a version line, and files of run folders without one, are changed; other files are used as they are.
     """
     version = _version(source.path)
     if version > VERSION:

@@ -179,7 +179,7 @@ def _verdict(methods: list[dict], counts: list[dict], cases: list[Case], amount:
         ]
         alone = [f"{row['what']} {row['error']}" for row in selected if "alone" in row["what"]]
         lines += [f"{source}: " + "; ".join(derived), f"{source}: " + "; ".join(alone)]
-    # Without an optimum inside the widths tried, nothing can be said of it.
+    # Without an optimum inside the widths tried, the formula cannot be tested.
     return lines + (in_words(cases) if any(case.inside for case in cases) else [])
 
 

@@ -78,8 +78,8 @@ class EyeSettings(Settings):
     """The eye: radius of the pupil, distance from pupil to retina, and whether it has human chromatic aberration.
 
     ``position``: displacement (y, x) of the eye from the axis, for the perspective from there. ``tolerance``: allowed
-    relative L2 error of the intensity from the propagation to the retina; by default the share of the tolerance of the
-    run, or 0.03 if that has none. If the error of collapsed propagation is larger, light is propagated element by
+    relative L2 error of the intensity from the propagation to the retina; by default a share of the tolerance of the
+    run, or 0.03 if the run has none. If the error of collapsed propagation is larger, light is propagated element by
     element, which takes 10 to 300 times as long and needs much memory.
     """
 
@@ -94,7 +94,7 @@ class LightSettings(Settings):
     """Sources to compare; laser, narrow_sled, sled and led have an FWHM of 1.4, 5, 10 and 20 nm.
 
     ``tolerance``: allowed error from summing over a few wavelengths instead of the whole spectrum, relative to the rms
-    intensity of a picture; by default the share of the tolerance of the run, or 0.02. ``extent``: sine of the half
+    intensity of a picture; by default a share of the tolerance of the run, or 0.02. ``extent``: sine of the half
     angle that each source, a disc, subtends at the hologram; 0 for a point source. ``dispersion``: the panel's phases
     depend on the wavelength, as those of a liquid crystal do. With it, or with an eye beside the axis, every wavelength
     is propagated.
@@ -125,8 +125,8 @@ class SweepSettings(Settings):
 class ObserverSettings(Settings):
     """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
-    ``volume``: a volume of your own in place of the scene's, as in runs of kind volume. ``transfer``: its colours and
-    opacities, as there. ``wavelengths``: those of the hologram, in place of the scene's.
+    ``volume``: a volume in place of the scene's, as in runs of kind volume. ``transfer``: its colours and opacities, as
+    in these runs. ``wavelengths``: wavelengths of the hologram, in place of the scene's.
     ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the visible
     depths. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times as
     many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina, divided between

@@ -155,7 +155,7 @@ class Observer:
 
     @property
     def separate(self) -> bool:
-        """Whether the wavelengths of a source have fields of their own, so that each must be propagated."""
+        """Whether the field of the hologram depends on the wavelength, so that each one must be propagated."""
         return self.settings.light.dispersion or any(self.settings.eye.position)
 
     def retina(self, depth: float) -> RetinaPlan:
@@ -260,7 +260,7 @@ def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Obse
         words = f"expected more than {longest / 2:.4g} m, half the longest wavelength, got {pitch:g} m"
         raise ConfigError([f"hologram.pitch: {words}"])
     budget = observer_budget(settings, scene_settings)
-    # An eye sees the hologram itself: the tolerance of a scene, too, is that of its hologram alone.
+    # The scene is not refocused, so that its tolerance is that of its hologram alone.
     hologram = scene_settings.hologram.model_copy(update={"tolerance": budget.share(HOLOGRAM)})
     scene = build(scene_settings.model_copy(update={"hologram": hologram, "tolerance": None}))
     budget.predict(HOLOGRAM, max(plan.predicted_error for plan in scene.plans))

@@ -95,7 +95,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
 
 
 def warnings(values: dict[str, Any]) -> list[str]:
-    """What spoils the pictures, from the result of :func:`geometry`; a sentence for each."""
+    """Reasons why pictures are dim or incomplete, from the result of :func:`geometry`; a sentence each."""
     lines = []
     if min(values["light_of_edge"]) < _INVISIBLE:
         lines.append(

@@ -15,9 +15,9 @@ _STEP = 1e-9  # metres between the wavelengths of the reference
 def observer_errors(eye: Observer) -> list[Comparison]:
     """Predicted and measured errors of the parts that share the tolerance of a run.
 
-    That of the propagation to the retina is not measured: its prediction leaves out shifts of the picture.
+    The error of the propagation to the retina is not measured, since its prediction excludes shifts of the picture.
     """
-    words = "not measured: a shift of the picture does not count; for points of light see holotorch chart eye"
+    words = "not measured: the prediction excludes shifts of the picture; for points of light see holotorch chart eye"
     retina = Comparison(RETINA, eye.budget.error(RETINA), None, words)
     return [hologram_error(eye.scene), wavelength_error(eye), retina]
 
@@ -35,7 +35,7 @@ def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
     lengths, weights = every[source]
     predicted, plan = eye.budget.share(WAVELENGTHS), eye.retina(depth)
     if eye.separate:
-        return Comparison(WAVELENGTHS, predicted, None, "not measured: each wavelength has a field of its own")
+        return Comparison(WAVELENGTHS, predicted, None, "not measured: every wavelength is propagated")
 
     def seconds(machine: Machine) -> float:
         pictures = plan.flops * FLOP_SECONDS[plan.method] * len(lengths)

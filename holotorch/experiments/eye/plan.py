@@ -91,7 +91,7 @@ def _shallow(eye: Observer) -> list[str]:
 
 
 def _scene(eye: Observer) -> str:
-    """The volume in words: an own one in the setting of the scene, or the scene's."""
+    """The volume in words: that of the configuration with the view of the scene, or the volume of the scene."""
     scene, own = eye.settings.scene.config, eye.settings.volume
     words = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
     if changes := eye.settings.scene.change:
@@ -126,7 +126,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     others = "" if eye.separate else "; the others are derived from them"
     if any(settings.eye.position):
         y, x = (1e3 * each for each in settings.eye.position)
-        lines.append(f"Eye        beside the axis, at y {y:.3g} mm, x {x:.3g} mm; light is that of an eye on the axis")
+        lines.append(f"Eye        beside the axis, at y {y:.3g} mm, x {x:.3g} mm; light below: for an eye on the axis")
     lines += [
         f"Light      {light}{others}{directions}",
         f"Phases     {settings.seeds} realisation(s) of the random phases, compared with the mean of "
@@ -144,7 +144,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     if settings.tradeoff:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  in addition, at {where} mm, by collapsed propagation; the cost above excludes it")
-    first = len(eye_geometry.warnings(values["geometry"]))  # beside the numbers of the geometry, above
+    first = len(eye_geometry.warnings(values["geometry"]))  # printed above, with the numbers of the geometry
     return "\n".join([*lines, *(f"WARNING    {words}" for words in values["warnings"][first:])])
 
 

@@ -45,7 +45,7 @@ _REFERENCE_SEED = 100_000  # first seed of the realisations whose mean is the re
 
 
 def scene_settings(settings: ObserverSettings) -> VolumeSettings:
-    """The configuration of the volume with its changes. ConfigError for a configuration of another kind."""
+    """Configuration of the volume, with the changes in the settings. ConfigError for one of another kind."""
     path = find_config(settings.scene.config)
     assert path is not None  # validated with the settings
     scene = load_config(path, list(settings.scene.change))
@@ -90,7 +90,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
         if settings.tradeoff:
             similarity = PerceptualSimilarity() if PerceptualSimilarity.is_there() else None
             if similarity is None:
-                print("tradeoff.csv is without LPIPS, whose weights are not here; see PerceptualSimilarity")
+                print("tradeoff.csv has no LPIPS, since its weights are not installed; see PerceptualSimilarity")
             cases = tradeoff(settings, eye.scene.settings, settings.tradeoff, similarity=similarity)
             files.write(write_table, folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
             print("\n".join(in_words(cases)))
@@ -123,7 +123,7 @@ class _Views:
         total: Sum of the pictures of the reference for each focus, [F, C, h, w].
         references: Number of realisations in ``total``.
         pictures: For each realisation, the pictures of all sources and foci, [sources, F, C, h, w].
-        checkpoint: The file that stores these pictures; None in all processes but the first, which help it.
+        checkpoint: The file that stores these pictures; None in all processes but the first.
     """
 
     def __init__(self, eye: Observer, checkpoint: Checkpoint | None):
@@ -210,7 +210,7 @@ def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], file
     sources, focus = eye.settings.light.sources, eye.focus
     files.write(save_array, out / "arrays" / "retina.npy", images[0])
     files.write(save_array, out / "arrays" / "reference.npy", reference)
-    # Equal values of all colours are shown as neutral grey. Each colour has the power of the rendering.
+    # Each colour is scaled to the power of the rendering; equal values of all colours give neutral grey.
     wavelengths = eye.scene.settings.wavelengths
     matrix, rendering = picture_matrix(wavelengths).float(), eye.scene.rendering()[0]
     reference = equal_power(reference, rendering.expand_as(reference))

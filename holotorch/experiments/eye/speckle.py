@@ -1,4 +1,4 @@
-"""Speckle by itself: what is left of a picture when the scene is divided out (thesis Sec. 6.4.2)."""
+"""Relative speckle: a picture divided by the speckle-free scene (thesis Sec. 6.4.2)."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from torch import Tensor
 from holotorch.experiments.runs.figures import figure_png
 from holotorch.metrics import anisotropy, grain_size, power_spectrum
 
-_RINGS = 24  # widths of a radial mean of the spectrum
+_RINGS = 24  # number of rings of a radial mean of the spectrum
 
 
 def relative_speckle(pictures: Tensor, reference: Tensor, least: Tensor) -> Tensor:
@@ -23,7 +23,7 @@ def grains(speckle: Tensor) -> dict[str, list[Any]]:
     """Medians over the realisations of relative speckle [S, C, h, w], for each of the C colours.
 
     ``grain_y``, ``grain_x``: full widths of the grains at half of the autocorrelation, in samples of the picture.
-    ``anisotropy``: length of the grains divided by their width. None where there is no speckle, or no end of a grain.
+    ``anisotropy``: length of the grains divided by their width. None without speckle, or if the grains are too large.
     """
     measured: dict[str, list[Any]] = {"grain_y": [], "grain_x": [], "anisotropy": []}
     for colour in speckle.unbind(1):
@@ -37,7 +37,7 @@ def grains(speckle: Tensor) -> dict[str, list[Any]]:
 
 
 def radial_spectrum(speckle: Tensor) -> tuple[Tensor, Tensor]:
-    """Frequencies [R] in cycles per sample, and the mean power spectrum [R] of speckle [..., h, w] in rings of them."""
+    """Frequencies [R] in cycles per sample, and the mean power spectrum [R] of speckle [..., h, w] in rings."""
     power = power_spectrum(speckle).flatten(0, -3).mean(0)
     fy, fx = (torch.fft.fftfreq(n, dtype=power.dtype) for n in power.shape)
     radius = torch.hypot(fy[:, None], fx.expand(len(fy), -1))

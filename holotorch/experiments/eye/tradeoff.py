@@ -103,7 +103,7 @@ def tradeoff(
 
     ``seeds`` realisations of the random phases are compared with the mean picture of ``others`` further realisations.
     Propagation is always collapsed, because each hologram needs many propagations per colour. ``similarity``, such as
-    ``PerceptualSimilarity()``, judges pictures [..., 1, h, w] beside SSIM.
+    ``PerceptualSimilarity()``, compares pictures [..., 1, h, w] in addition to SSIM.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):

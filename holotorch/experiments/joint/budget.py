@@ -12,12 +12,12 @@ from holotorch.experiments.planning.correction import HEAT, PROPAGATION, STOPPIN
 from holotorch.experiments.planning.tolerance import Budget, Part
 from holotorch.modulator import ThermalCrosstalk
 
-SLABS = "planes"  # part that errs since a plane stands for a slab of the volume
+SLABS = "planes"  # part with the error of representing slabs of the volume by planes
 PATIENCE = 10  # small changes of the loss in a row after which the solver stops, with a tolerance
 _COUNTS = (5, 8, 12, 16, 24, 32, 48, 64)  # numbers of planes to choose from
-_DEVIATION = 2.5  # rad, of the heater phases, which are phases within a cycle before they are deconvolved
+_DEVIATION = 2.5  # rad, of the heater phases: phases within one cycle, deconvolved
 _EDGE = 0.6  # error of an image / number of samples in the radius of its pupil; 0.2 to 0.6 with 48 to 128 px
-PADDINGS = 1, 2, 4  # factors on the distance that the padding of a view has room for
+PADDINGS = 1, 2, 4  # factors on the longest distance for which the padding of a view suffices
 
 
 def joint_budget(settings: JointSettings, error_of_planes: float, padded: Callable[[int], Grid]) -> Budget:
@@ -98,7 +98,7 @@ def _begun(settings: JointSettings, error_of_planes: float, error_of_edges: floa
 def _parts(settings: JointSettings, error_of_planes: float, error_of_edges: float) -> list[Part]:
     """The parts in the order in which they are planned, with their errors in a run without tolerance.
 
-    Such a run takes all steps, whatever they leave.
+    Such a run takes all steps, whatever error remains.
     """
     given = error_of_planes if settings.display.planes is not None else None
     heat = correction.cropping_error(

@@ -1,4 +1,4 @@
-"""Settings of a volume that is shown by frames of a phased array and corrected for what an eye sees of it."""
+"""Settings of a volume that frames of a phased array show, corrected for the views of an eye."""
 
 import math
 from typing import Annotated, Any, ClassVar, Literal
@@ -22,20 +22,21 @@ from holotorch.experiments.config.source import Key
 from holotorch.experiments.volume.config import Depth, TransferSettings, ViewSettings, VolumeSource
 
 REFERENCE = 630e-9  # metres, wavelength of ``display.rad_per_K``
-PLANES = 5  # of a run without tolerance that states no number
+PLANES = 5  # number of planes of a run without tolerance, if it is not stated
 Baseline = Literal["random", "afterwards", "unheated", "retrieved", "retrieved_pec", "slabs"]
 
 
 class DisplaySettings(GridSettings):
     """The phased array, and where the volume appears behind it.
 
-    ``distance``: of the volume's middle. ``depth``: the volume is stretched along the axis to this extent, since one as
-    deep as it is wide would be sharp at every focus; not stretched by default. ``planes``: number of planes that hold
-    its light; by default 5, or as many as the tolerance of the run needs (up to 64, with slabs one per frame).
+    ``distance``: distance of the volume's middle. ``depth``: the volume is stretched along the axis to this extent,
+    since one as deep as it is wide would be sharp at every focus; not stretched by default. ``planes``: number of
+    planes that hold its light; by default 5, or as many as the tolerance of the run needs (up to 64, with slabs one
+    per frame).
     ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
     the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm). ``max_temperature``: in its place a
-    limit on the temperature of every pixel above ambient, such as 500 degC, which all colours
-    share in phase. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
+    limit on the temperature of every pixel above ambient, such as 500 degC, which gives
+    one limit in phase for all colours. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
     """
 
     distance: Depth
@@ -50,11 +51,11 @@ class DisplaySettings(GridSettings):
 class EyeSettings(Settings):
     """The eye, which looks from far away and may focus on every depth.
 
-    ``pupil``: radius of the pupil in the directions that the array emits at the shortest wavelength, 1 for all of them;
+    ``pupil``: radius of the pupil, relative to the largest sine that the array emits at the shortest wavelength;
     pixels resolve the image up to 0.5. ``parallax``: number of smaller pupils, at random positions within the pupil and
     with random foci, that are corrected too, so that the image also holds for parts of the pupil.
-    ``occlusion``: what the planes hide from each other is that along the axis for all pupils, or that of the directions
-    within each pupil.
+    ``occlusion``: for all pupils, planes occlude each other as along the axis (``axis``), or for each pupil as in its
+    directions (``pupil``).
     """
 
     pupil: Annotated[Number, Field(gt=0, le=1)] = 0.5
@@ -85,12 +86,13 @@ class JointReport(Settings):
 class JointSettings(Settings):
     """A volume shown by ``frames`` heater patterns in turn, optimised together for what an eye sees at every focus.
 
-    One wavelength shows the mean of the volume's colours, three show red, green and blue. ``steps``: of L-BFGS.
-    ``light_weight``: weight of the light that misses the pupil or the window, against the error of the images.
+    One wavelength shows the mean of the volume's colours, three show red, green and blue. ``steps``: largest number of
+    L-BFGS steps. ``light_weight``: weight of the light that misses the pupil or the window, against the error of
+    the images.
     ``heat``: heat that is left from earlier frames is part of the model; by default each frame starts cold.
     ``tolerance``: allowed relative L2 error of the images, divided between the taps of the heat kernel, the planes
     (``display.planes``), the padding and precision of the propagation, and the stopping rule; without it all steps are
-    taken. It does not bound the error of what the array cannot form.
+    taken. It does not bound the error that remains because the array cannot form the images.
     """
 
     elsewhere: ClassVar[dict[str, str]] = {

@@ -29,7 +29,7 @@ from holotorch.scene.layers import SlabLayers, SourceLayers
 
 _PENALTY_FROM = 0.985  # fraction of the limit above which phases are penalised, so that little is left to scale down
 _TOLERANCE = 3e-3  # relative L2 error of the fields that the start is made of
-_RINGS = 2  # of directions within a pupil, for what planes hide from each other
+_RINGS = 2  # rings of directions within a pupil, for the occlusion between planes
 _VIEWS_SEED = 1 << 40  # added to the seed for the random pupils, so that they are independent of the start
 
 
@@ -88,13 +88,13 @@ class JointExperiment:
         return shares.joint_budget(self.settings, self.slab_error, self.padded)
 
     def padded(self, factor: int) -> Grid:
-        """Padded grid of a view with room for light that travels ``factor`` times as far as to the farthest focus."""
+        """Padded grid of a view for light that travels up to ``factor`` times as far as to the farthest focus."""
         pupil, farthest = View(max(self.foci), self.radius), factor * max(self.foci)
         return view_padding(self.grid, self.settings.wavelengths, [pupil], farthest)
 
     @cached_property
     def padding(self) -> int:
-        """Factor of :meth:`padded` that the tolerance asks for."""
+        """Factor of :meth:`padded` that the tolerance requires."""
         errors = {factor: shares.edge_error(self.settings, self.padded(factor)) for factor in shares.PADDINGS}
         return shares.padding(self.settings, self.budget.share(PROPAGATION), errors)
 
@@ -223,7 +223,7 @@ class JointExperiment:
 
     @cached_property
     def heat(self) -> ThermalCrosstalk | HeatCycle:
-        """From heater phases to the phases that the frames show, with heat that is left from earlier frames."""
+        """Operator from heater phases to the phases that the frames show, with heat left from earlier frames."""
         return self.heat_after(self.crosstalk)
 
     def heat_after(self, crosstalk: ThermalCrosstalk) -> ThermalCrosstalk | HeatCycle:

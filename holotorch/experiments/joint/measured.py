@@ -1,4 +1,4 @@
-"""Measured errors of the parts that share the tolerance of a joint run, for the phases that it found."""
+"""Measured errors of the parts that share the tolerance of a joint run, for its result."""
 
 import math
 from collections.abc import Callable
@@ -23,14 +23,14 @@ from holotorch.experiments.volume.plan import rendering_seconds
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import PupilViews
 
-_FINER = 2  # factor on the samples of a view (each axis), in the reference of the propagation
+_FINER = 2  # factor on the padded samples of a view along each axis, in the reference of the propagation
 _THINNER = 4  # factor on the number of planes in the reference of the rendering
 
 Measure = Callable[[JointExperiment, Solution], tuple[float | None, str]]
 
 
 def joint_errors(experiment: JointExperiment, solution: Solution, limit: float = LIMIT) -> list[Comparison]:
-    """Predicted and measured errors of the parts; ``limit``: seconds of each on the reference machine."""
+    """Predicted and measured errors of the parts; ``limit``: longest time of each measurement, see LIMIT."""
     parts: dict[str, tuple[Measure, Callable[[Machine], float]]] = {
         HEAT: (_heat, lambda machine: 2 * shown_seconds(experiment, machine)),
         SLABS: (_planes, lambda machine: (1 + _THINNER) * rendering_seconds(experiment.scene, machine)),
@@ -48,7 +48,7 @@ def joint_errors(experiment: JointExperiment, solution: Solution, limit: float =
 
 
 def _shown(experiment: JointExperiment, solution: Solution) -> Shown:
-    """What the phases show in double precision."""
+    """Fields that the phases of the solution emit, in double precision."""
     return show(experiment, solution.x.double())
 
 
@@ -56,7 +56,7 @@ def _heat(experiment: JointExperiment, solution: Solution) -> tuple[float, str]:
     """Error of the kernel's taps in the images at all corrected foci."""
     shown, views = _shown(experiment, solution), experiment.stack.operator
     assert shown.phase is not None
-    # Heat that is left from earlier frames adds pixel by pixel, before or after it spreads.
+    # Heat left from earlier frames is a sum for each pixel, which may be taken before or after the spreading.
     left = experiment.heat_after(ThermalCrosstalk(0.0).to(experiment.device))
     exact = Shown(phasor(left(spread_completely(experiment.settings.display.sigma_px, shown.phase))))
     with torch.no_grad():
@@ -67,7 +67,7 @@ def _heat(experiment: JointExperiment, solution: Solution) -> tuple[float, str]:
 def _propagation(experiment: JointExperiment, solution: Solution) -> tuple[float, str]:
     """Error of padding and precision in the images at all corrected foci."""
     own, grid = experiment.stack.operator, experiment.grid
-    # Room is added on both sides of the window, for a distance in proportion to it.
+    # The padding is proportional to the distance, so a larger grid is requested by a longer distance.
     room = max((_FINER * n - m) / (n - m) for n, m in zip(own.padded.shape, grid.shape, strict=True) if n > m)
     longest = experiment.padding * max(experiment.foci) * room
     finer = PupilViews(grid, experiment.settings.wavelengths, own.views, longest=longest).to(experiment.device)
@@ -95,7 +95,7 @@ def _stopping(experiment: JointExperiment, solution: Solution) -> tuple[float | 
     solver = replace(experiment.solver(experiment.crosstalk), max_steps=PATIENCE, tolerance=0.0)
     try:
         further = solver(problem, solution.x)
-    except ValueError as error:  # images that are exact, so that no gradient is left
+    except ValueError as error:  # the gradient vanishes if the images are exact
         return None, f"not measured: {error}"
     views = experiment.stack.operator
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Other ways to show a volume, which the joint correction is compared with: what F frames emit, and laser powers."""
+"""Other methods to show a volume, for comparison with the joint correction: fields of F frames, laser powers."""
 
 from dataclasses import dataclass, replace
 

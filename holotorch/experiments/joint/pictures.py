@@ -15,7 +15,7 @@ from holotorch.io.images import encode_animation
 from holotorch.optics.picture import tone_map
 
 SWEEP = 17  # foci of the animated sweep
-_SECONDS = 0.12  # that each of them is shown
+_SECONDS = 0.12  # seconds for which each of them is shown
 
 
 def write(

@@ -80,7 +80,7 @@ def _steps(values: dict[str, Any], settings: JointSettings) -> str:
 
 
 def _temperatures(settings: JointSettings) -> str:
-    """Of the hottest pixel that the limit allows, for each wavelength."""
+    """Temperature of the hottest pixel that the limit allows, for each wavelength."""
     response = [settings.display.rad_per_K * REFERENCE / wavelength for wavelength in settings.wavelengths]
     return " / ".join(f"{settings.limit / each:.0f}" for each in response)
 

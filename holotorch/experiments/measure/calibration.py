@@ -23,7 +23,7 @@ from holotorch.tracking.pose.band_edges import BandEdges, fit_band_edges
 from holotorch.tracking.pose.pose import solve_pose
 
 _MOST = 200  # frames of a fit: more of one recording show the same poses again
-_OUTLIER = 25.0  # chi-square of a frame above the median, from which on its edges are taken for wrong: 5 sigma
+_OUTLIER = 25.0  # chi-square of a frame above the median, above which its edges count as wrong: 5 sigma
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -146,7 +146,7 @@ def measure_prediction(settings: MeasureSettings, tracks: Sequence[Track]) -> Re
 
 
 def measure_edges(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
-    """Positions of the band edges, and a file of the corrected catheter. ConfigError if the frames leave them open."""
+    """Positions of the band edges, and a file of the corrected catheter. ConfigError if the frames do not suffice."""
     (track,) = tracks
     measured = measure_catheter(track.edges, track.source, settings.known, settings.resting)
     rows = catheter_rows(measured)
@@ -158,7 +158,7 @@ def measure_edges(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
 
 
 def measure_tone(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
-    """Tone curve of the camera, and its file with it. ConfigError if the photographs do not determine a curve."""
+    """Tone curve of the camera, and its file with this curve. ConfigError if the photographs do not suffice."""
     (track,) = tracks
     tone, save = measure_camera(track.source, settings)
     levels = torch.arange(256, dtype=torch.float64) / 255

@@ -14,7 +14,7 @@ from holotorch.io.images import load_image
 
 
 class Crops(Dataset[Tensor]):
-    """Crops of photographs as light with a mean of 1, float32 [1, size, size], each with its own place and mirroring.
+    """Crops of photographs as light with a mean of 1, float32 [1, size, size], with different positions and mirroring.
 
     Args:
         sources: Names of bundled pictures, or paths.

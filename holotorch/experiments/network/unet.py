@@ -13,8 +13,8 @@ class PhaseUNet(nn.Module):
     """Heater phases [B, C, H, W] in rad, 0 to ``limit``, for wanted intensities [B, C, H, W].
 
     The input of the network is the wanted amplitude, propagated back to the modulator with a flat phase: real and
-    imaginary part for each colour. What diffraction spreads is thus already in place, and the network, whose
-    convolutions look at a neighbourhood, corrects phase, amplitude and heat. H and W are multiples of 4.
+    imaginary part for each colour. Diffraction is thus accounted for already, and the network, whose
+    convolutions are local, corrects phase, amplitude and heat. H and W are multiples of 4.
 
     Args:
         propagator: From modulator to image, with ``adjoint``.

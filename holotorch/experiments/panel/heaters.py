@@ -1,4 +1,4 @@
-"""Files for the heaters of a phased array from a finished run: what drives them, how warm it gets, what it emits."""
+"""Files for the heaters of a phased array from a finished run: drive phases, temperatures, and phases of the light."""
 
 import csv
 import io
@@ -41,7 +41,7 @@ class _Chip:
     Attributes:
         phase: Heater phases in rad, float64 [F, C, H, W].
         array: The chip's response to heat.
-        spread: From heater phases to the phases of the light, with all that the run knows of the heat.
+        spread: Function from heater phases to the phases of the light, with the model of the heat of the run.
         limit: Upper limit of the run on the phases of the light in rad; None without one.
     """
 
@@ -55,9 +55,9 @@ def export_heaters(folder: Path, out: Path | None = None, *, bits: int = 16) -> 
     """Write the heater phases, temperatures and optical phases of a run of kind ``pec`` or ``joint``.
 
     For each frame and colour and each of the three, a NumPy file (float32 [H, W]), a CSV file (a line for each row of
-    pixels) and a 16-bit PNG; ``export.json`` says which is which, its unit, and what a step of the PNG stands for. The
+    pixels) and a 16-bit PNG; ``export.json`` gives the quantity and unit of each file, and the step of the PNG. The
     PNG of the heaters holds drive levels of ``bits`` bits, evenly spaced from 0 to the largest phase of the run. Heat
-    that is left from earlier frames counts if the run counts it; the files then hold the end of each frame.
+    left from earlier frames is included if the run includes it; the values are then those at the end of each frame.
 
     Returns:
         The folder of the files (``out``, by default ``heaters`` in that of the run), and the content of export.json.
@@ -120,7 +120,7 @@ def heaters_text(report: dict[str, Any]) -> str:
     """The export in words."""
     step, limit, peak = report["files"][0]["png_step"], report["limit_rad"], report["peak_phase_of_levels_rad"]
     warning = ""
-    # Less than a degree at the thesis's limit of 700; 16 bits and float32 exceed a limit by far less.
+    # 1e-3 is less than a degree at the thesis's limit of 700; rounding to 16 bits or float32 stays far below it.
     if limit is not None and peak > limit * (1 + 1e-3):
         warning = (
             f"\nWARNING: rounded to {report['heater_bits']} bits, the heaters take the light to {peak:.4g} rad, "

@@ -118,7 +118,7 @@ class NearFieldSettings(Settings):
 class _SolverSettings(Settings):
     """Solver settings. A run stops after ``patience`` successive relative changes of the loss below ``tolerance``.
 
-    By default, that follows from the tolerance of the run; if the run has none, it is 1e-3, of L-BFGS 1e-4.
+    By default, that follows from the tolerance of the run; if the run has none, it is 1e-3, or 1e-4 for L-BFGS.
     ``reruns``: how often at most a hologram with speckle noise (bright pixels that come out dark) is solved again from
     other random phases; the one with the fewest is kept.
     """

@@ -1,4 +1,4 @@
-"""Measured errors of the parts that share the tolerance of a run of kind ``pec``, for the phases that it found."""
+"""Measured errors of the parts that share the tolerance of a run of kind ``pec``, for its result."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from holotorch.experiments.planning.machine import Machine, machine_speed
 
 
 def pec_errors(experiment: PECExperiment, solution: Solution, limit: float = LIMIT) -> list[Comparison]:
-    """Predicted and measured errors of the parts; ``limit``: seconds of each on the reference machine."""
+    """Predicted and measured errors of the parts; ``limit``: longest time of each measurement, see LIMIT."""
     here, phase = machine_speed(experiment.device), experiment.heater_phases(solution.x)
     affordable = simulation_seconds(experiment, Machine()) <= limit
     compared = []
@@ -68,7 +68,7 @@ def _stopping(experiment: PECExperiment, solution: Solution) -> tuple[float | No
     try:
         solver = replace(stage.solver, max_steps=steps, tolerance=0.0)  # type: ignore[type-var]  # all are dataclasses
         further = solver(stage.objective, solution.x, stage.box)
-    except ValueError as error:  # a picture that is exact, so that no gradient is left
+    except ValueError as error:  # the gradient vanishes if the picture is exact
         return None, f"not measured: {error}"
     with torch.no_grad():
         before, after = (experiment.picture_in(problem.intensity(x)) for x in (solution.x, further.x))

@@ -92,7 +92,9 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     if planned := values.get("single_propagation"):
         lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
     if region := settings.target.region:
-        lines.append(f"Region     the middle {region[0]} x {region[1]} px hold the picture; light elsewhere is free")
+        lines.append(
+            f"Region     the middle {region[0]} x {region[1]} px hold the picture; other pixels are not constrained"
+        )
     if weight := settings.target.weight:
         lines.append(
             f"Weight     squared errors count (1 + E / {weight.e2_deg:g} deg)^-2 at E from the gaze; the picture spans "
@@ -150,7 +152,7 @@ def _crosstalk_line(values: dict[str, Any]) -> str:
                 f"{values['fit_residual']:.2g} of it (rms)"
             )
             if values["fit_residual"] > _NO_GAUSSIAN:
-                line += ": no Gaussian stands for this kernel where only a sigma can be given"
+                line += ": where only a sigma can be given, no Gaussian represents this kernel"
         return line
     return (
         f"Crosstalk  heat spreads with sigma {values['sigma_px']:g} px over {values['taps']} taps "

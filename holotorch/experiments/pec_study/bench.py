@@ -54,7 +54,7 @@ class Bench:
     Attributes:
         images: Names of the photographs.
         size: Pixels of the array from left to right; the array is 2 mm wide.
-        height: Pixels of the array from top to bottom; None for as many.
+        height: Pixels of the array from top to bottom; None for a square array.
         colour: Whether each photograph has three channels at the wavelengths of the thesis, instead of one at 530 nm.
         sigma_px: Width of the heat kernel exp(-d^2 / sigma^2) in pixels.
         kind: "fourier" (far field), "fresnel" (near field of the array repeated periodically, as in the thesis),

@@ -167,7 +167,7 @@ def _tables(statements: dict[str, list[dict[str, Any]]], word: str) -> list[str]
 
 
 def _judged(value: float, statement: dict[str, Any], word: str) -> tuple[str, str]:
-    """Verdict on a statement, and what was found beside what was expected."""
+    """Verdict on a statement, and the value beside the expected one."""
     if math.isnan(value):
         return "not testable here", "no such rows"
     if "printed" in statement:

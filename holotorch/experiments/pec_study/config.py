@@ -13,10 +13,10 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
 def _photographs(value: Any) -> Any:
-    """The entries, with the pictures of a folder in its place, by name."""
+    """The entries; a folder is replaced by its pictures in the order of their names."""
     entries: list[Any] = []
     for entry in several(value):
-        if isinstance(entry, str) and os.path.isdir(entry):  # False, unlike Path's, for a name that is too long
+        if isinstance(entry, str) and os.path.isdir(entry):  # unlike Path.is_dir, False for a name that is too long
             entries += [str(path) for path in sorted(Path(entry).iterdir()) if path.suffix.lower() in _PICTURES]
         else:
             entries.append(entry)

@@ -42,7 +42,7 @@ def reproduction(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases
 
 
 def photographs(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """The thesis's own terms: colour photographs of 384 x 256 pixels in the far field, as in Fig. 4.9."""
+    """Colour photographs of 384 x 256 pixels in the far field, as in thesis Fig. 4.9."""
     for sigma in cases.each(sigmas, desc="photographs", unit="sigma"):
         setup = replace(bench, sigma_px=sigma, height=bench.size * 2 // 3, colour=True)
         yield from _methods(setup, steps, ("none", *_CORRECTED), setting=f"{len(bench.images)} colour photographs")

@@ -18,7 +18,7 @@ _RESIDUAL = 0.3
 # Error of single precision in the intensity of phases of some rad; 2e-7 to 3e-6 in the same runs.
 _ROUNDING = {torch.float32: 3e-6, torch.float64: 1e-14}
 _FINEST = 1e-7  # relative change of a loss that float32 can still resolve
-_MARGIN = 4  # taps on each side by which the kernel that counts as complete is wider than one with all taps of 1e-6
+_MARGIN = 4  # taps on each side of the complete kernel, in addition to all taps of at least 1e-6
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class HeaterPhases:
 
 
 def complete_kernel(sigma_px: float) -> ThermalCrosstalk:
-    """The heat kernel with all taps that make a difference in double precision of a picture."""
+    """The heat kernel with all taps that change a picture in double precision."""
     return ThermalCrosstalk(sigma_px, 2 * (ThermalCrosstalk(sigma_px).radius + _MARGIN) + 1)
 
 
@@ -43,7 +43,7 @@ def spread_completely(sigma_px: float, phase: Tensor) -> Tensor:
 
 
 def needed_taps(sigma_px: float, taps: int) -> int | None:
-    """``taps`` for :class:`ThermalCrosstalk`; None if it takes no more by itself."""
+    """``taps`` for :class:`ThermalCrosstalk`; None if its default has no more taps."""
     return taps if taps < 2 * ThermalCrosstalk(sigma_px).radius + 1 else None
 
 
@@ -76,7 +76,7 @@ def cropped_taps(sigma_px: float, share: float, heaters: HeaterPhases) -> int:
 
 
 def stopping_error(tolerance: float, patience: int) -> float:
-    """What a solver leaves that stops after ``patience`` relative changes of the loss below ``tolerance``.
+    """Error of a solver that stops after ``patience`` relative changes of the loss below ``tolerance``.
 
     It is the part of the residual that as many further steps would remove at the same rate.
     """
@@ -99,7 +99,7 @@ def rounding_error(dtype: torch.dtype) -> float:
 
 
 def scaled_error(image: Tensor, exact: Tensor) -> float:
-    """Relative L2 error of an intensity at its best scale; 0 if both are dark."""
+    """Relative L2 error of an intensity at its best scale; 0 if both are 0."""
     image, exact = image.double(), exact.double()
     square, norm = image.square().sum().item(), exact.norm().item()
     scale = (image * exact).sum().item() / square if square else 0.0

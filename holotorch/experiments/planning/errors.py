@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-LIMIT = 30.0  # seconds on the reference machine that a reference may take, if the run takes as long
+LIMIT = 30.0  # longest time of a measurement, in seconds on the reference machine of ``machine``
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ def error_values(comparisons: Sequence[Comparison]) -> dict[str, Any]:
 
 
 def measured_values(measure: Callable[[], Sequence[Comparison]]) -> dict[str, Any] | None:
-    """Entries of summary.json; none if memory is short, since all else of a run is computed by then.
+    """Entries of summary.json; empty if memory is short, since the rest of the run is complete by then.
 
-    None, for a run that is not complete, if a signal interrupts the measurement: resuming measures them.
+    None if a signal interrupts the measurement: the run is then not complete, and resuming it measures the errors.
     """
     try:
         return error_values(measure())
@@ -52,7 +52,7 @@ def measured_values(measure: Callable[[], Sequence[Comparison]]) -> dict[str, An
         return None
     except MemoryError:
         return {}
-    except RuntimeError as error:  # torch's own way to say so
+    except RuntimeError as error:  # raised by torch if memory runs out
         if not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
             raise
         return {}

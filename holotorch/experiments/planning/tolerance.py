@@ -1,10 +1,10 @@
-"""One tolerance of a run, divided among the parts that err.
+"""One tolerance of a run, divided among the parts that contribute errors.
 
 The errors of independent parts add in squares. Of N parts that share a tolerance T, the part that is planned first may
 err by T / sqrt(N). When its error is predicted, the rest, sqrt(T^2 - e^2), is divided among the others by the same
-rule, so that a part without error gives its whole share to the parts after it. A part with a setting of its own keeps
-that, which counts as its error. If such settings leave nothing, the other parts get T / sqrt(N), and the plan says that
-the tolerance is exceeded.
+rule, so that a part without error gives its whole share to the parts after it. A part with its own setting keeps
+it, and the setting counts as its error. If such settings leave nothing, the other parts get T / sqrt(N), and the plan
+says that the tolerance is exceeded.
 """
 
 import math
@@ -15,12 +15,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a run that errs.
+    """A part of a run that contributes an error.
 
     Attributes:
         name: In words, such as "hologram".
         default: Tolerance of the part if neither the run nor the part has one, relative L2 error.
-        key: Setting of the part that wins over its share; "" if there is none.
+        key: Setting of the part that overrides its share; "" if there is none.
         given: Value of that setting, or None.
     """
 
@@ -53,7 +53,7 @@ class Budget:
         return self._shares[name]
 
     def predict(self, name: str, error: float) -> None:
-        """State the predicted error of a part, before the shares of the parts after it are asked for."""
+        """State the predicted error of a part, before the shares of the parts after it are requested."""
         self._predicted[name] = error
 
     def _divided(self, name: str) -> float:

@@ -174,7 +174,7 @@ def draw_front(axes: Axes, points: Iterable[tuple[float, float]], label: str = "
 
 
 def mark_choice(axes: Axes, points: Iterable[tuple[float, float]], label: str = "automatic choice") -> None:
-    """A black ring around each point (time, error) of what is chosen unless the user states another."""
+    """A black ring around each point (time, error) of an automatic choice."""
     style = {"markersize": 14, "markerfacecolor": "none", "markeredgecolor": "black", "zorder": 1}
     axes.plot(*zip(*points, strict=True), "o", label=label, **style)
 

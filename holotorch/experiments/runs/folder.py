@@ -125,7 +125,7 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
 
 
 def tidied(folder: Path) -> bool:
-    """Remove temporary files of a complete run; returns whether its page is missing. ConfigError if a run uses it."""
+    """Remove temporary files of a complete run; returns whether its page is missing. ConfigError if it is in use."""
     with _locked(folder):
         for path in (*folder.rglob(".*.partial"), folder / "checkpoint.pt", folder / "interrupted.json"):
             with suppress(OSError):  # a remaining file does no harm

@@ -32,7 +32,7 @@ def process_count() -> tuple[int, int]:
 
 
 def from_first(counts: list[int]) -> list[int]:
-    """The numbers that the first process has, in all of them. ConnectionError if one has ended."""
+    """The numbers of the first process, returned by all processes. ConnectionError if a process has ended."""
     values = torch.tensor(counts)
     if process_count()[1] > 1:
         with _connected():
@@ -41,7 +41,7 @@ def from_first(counts: list[int]) -> list[int]:
 
 
 def added(part: Tensor) -> Tensor:
-    """Sum of the tensors of all processes, in place, in all of them. ConnectionError if one has ended."""
+    """Sum of the tensors of all processes, written to ``part`` in each. ConnectionError if a process has ended."""
     if process_count()[1] > 1:
         with _connected():
             torch.distributed.all_reduce(part)
@@ -52,5 +52,5 @@ def added(part: Tensor) -> Tensor:
 def _connected() -> Iterator[None]:
     try:
         yield
-    except RuntimeError as error:  # torch's own way to say so
+    except RuntimeError as error:  # raised by torch if the connection is lost
         raise ConnectionError("another process of this run has ended") from error

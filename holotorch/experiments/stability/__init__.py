@@ -1,1 +1,1 @@
-"""Stability: every method across the border of its validity, with what it predicts and what it says there."""
+"""Stability: every method within and beyond the limits of its validity, with predicted errors and warnings."""

@@ -1,4 +1,4 @@
-"""Chart of stability: what every method does at and beyond the border of its validity."""
+"""Chart of stability: errors and warnings of every method at and beyond the limits of its validity."""
 
 import math
 import statistics

@@ -1,4 +1,4 @@
-"""Sweeps of the heat of a phased array: kernels that cut it, and phases that undo it."""
+"""Sweeps of the heat crosstalk of a phased array: kernels with few taps, and deconvolution."""
 
 from functools import partial
 
@@ -69,11 +69,11 @@ def _inverted(sigma: float, size: int | None = None) -> Answer:
 
 
 def _deconvolved(sigma: float) -> Answer:
-    """The phase that the heater phases of ``deconvolve`` spread to, without the cut of the kernel."""
+    """Phase after spreading by the complete kernel, of the heater phases from ``deconvolve``."""
     x = deconvolve(ThermalCrosstalk(sigma), _reached(sigma), max_steps=400)
     return Answer(_spread_exactly(sigma, x))
 
 
 def _reached(sigma: float) -> Tensor:
-    """A phase that some heater phases reach."""
+    """A phase that some heater phases give after spreading."""
     return _spread_exactly(sigma)

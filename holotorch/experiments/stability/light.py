@@ -52,7 +52,7 @@ def _sum(wavelengths: Tensor, weights: Tensor, distance: float) -> Tensor:
 
 
 def _few(distance: float, tolerance: float, fwhm: float) -> Answer:
-    """The image under the wavelengths that a tolerance asks for; the band of the grid limits the light, no iris."""
+    """The image under the wavelengths that a tolerance requires; the band of the grid limits the light, not an iris."""
     spectrum = Spectrum.lorentzian(CENTRE, fwhm)
     aperture = math.hypot(*(CENTRE / (2 * pitch) for pitch in SMALL.pitch))
     difference = path_difference(distance, aperture)
@@ -78,7 +78,7 @@ def _inside() -> Tensor:
 
 
 def _followed(tolerance: float, fwhm: float) -> Answer:
-    """The image [1, H, W] with as many wavelengths propagated as the tolerance asks for.
+    """The image [1, H, W] with as many wavelengths propagated as the tolerance requires.
 
     The error of the propagation of each wavelength is left to ``Retina`` and is the same in the reference.
     """
@@ -91,7 +91,7 @@ def _followed(tolerance: float, fwhm: float) -> Answer:
 
 
 def _each(tolerance: float, fwhm: float) -> Tensor:
-    """The same image with every wavelength propagated, in the same window, whose size shifts the samples of a pupil."""
+    """The same image with every wavelength propagated, in the same window, so that the pupil has the same samples."""
     wavelengths, weights = _light(fwhm)
     count = least_followed(wavelengths, weights, tolerance, GRID, *OPTICS)
     wide = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE).wide[0]

@@ -57,7 +57,7 @@ class Case:
         return Answer(result, plan.predicted_error, plan.method + paraxial, self.tolerance)
 
     def exact(self) -> Tensor:
-        """What should arrive."""
+        """The exact field in the window of the result."""
         grid, out = self.grids
         return reference.propagated(self.field(), grid, self.wavelength, self.distance, out, self.offset, self.tilt)
 
@@ -113,7 +113,7 @@ def _samplings() -> list[Sweep]:
 
 
 def _windows() -> list[Sweep]:
-    """Where and how finely the result is observed, and how steeply its light travels."""
+    """Offset, pitch and size of the window of the result, and tilt of the carrier."""
     offsets, sines = (0.0, 0.3, 0.5, 1.0, 1.5, 2.0, 4.0, 10.0), (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99)
     ratios, near = (0.05, 0.2, 0.5, 0.9, 1.0, 1.3, 2.0, 5.0, 20.0), replace(BASE, distance=1e-4)
     aside, pitch = "offset (windows)", "pitch of the result (of the field's)"

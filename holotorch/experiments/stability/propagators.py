@@ -14,7 +14,7 @@ from holotorch.optics import AngularSpectrum, CroppedKernel, Fraunhofer, Fresnel
 WAVELENGTH = 530e-9  # metres
 COARSE, FINE = Grid((32, 28), 8e-6), Grid((32, 28), 1.5e-6)
 WRAPS = 1e-2  # part of noise that wraps around within the padding that AngularSpectrum accepts, as it documents
-LARGEST = 0.05  # a documented error beyond this is no tolerance: a method that errs by half of the field must say so
+LARGEST = 0.05  # largest documented error that counts as a tolerance; with a larger one, a method must warn
 ROUNDING = 1e-3  # tolerance where the documentation says that the only error is rounding, for the sake of complex64
 
 

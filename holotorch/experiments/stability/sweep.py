@@ -1,4 +1,4 @@
-"""A sweep of one method across its border, and what became of each point."""
+"""A sweep of one method beyond the limits of its validity, and the outcome at each point."""
 
 import math
 import warnings
@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-SILENT = 10  # times the tolerance: a greater error without a word is a failure
-DEFAULT = 1e-3  # tolerance of methods that neither ask for one nor document one
+SILENT = 10  # factor on the tolerance: a larger error without a warning is a failure
+DEFAULT = 1e-3  # tolerance of methods that have no such argument and document no error
 ASKED, DOCUMENTED, DEFAULTED = "asked", "documented", "1e-3 by default"  # where a tolerance comes from
 
 Value = float | str
@@ -89,7 +89,7 @@ class Sweep:
         swept: Name of the quantity, with its unit.
         values: Values from inside the domain of validity to beyond it.
         answer: What the method returns for a value. Its warnings count, and ValueError or MemoryError is a refusal.
-        exact: What it should return.
+        exact: The exact result for a value.
         tolerance: Largest accepted error.
         tolerance_from: ASKED, DOCUMENTED or DEFAULTED.
         error: Difference of ``answer`` and ``exact``.
@@ -126,7 +126,7 @@ class Sweep:
         return points
 
     def _point(self, value: Value, before: str) -> tuple[Point, str]:
-        """The point of one value, and the chosen method; ``before`` is that of the value before."""
+        """The point of one value, and the chosen method; ``before`` is that of the previous value."""
         row = self.method, self.swept, value
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -142,7 +142,7 @@ class Sweep:
         elif before and answer.chosen != before:
             said = "switched"
         tolerance = self.tolerance if answer.tolerance is None else answer.tolerance
-        with warnings.catch_warnings(action="ignore"):  # what a reference says is not what the method says
+        with warnings.catch_warnings(action="ignore"):  # warnings of the reference are not those of the method
             error = self.error(answer.result, self.exact(value))
         # A result that is not finite is wrong by any measure.
         measured = math.inf if math.isnan(error) else error

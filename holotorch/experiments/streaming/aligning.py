@@ -32,9 +32,9 @@ _FARTHEST = 10.0  # metres from the headset to the virtual catheter
 class Aligner:
     """The frame of the poses that a page shows: the camera's, until a user has aligned it with a headset.
 
-    Called with each pose, which it keeps, it returns the pose in the present frame: that of the file, if there is one,
-    and of the newest fit otherwise. All alignments are also written to a table beside the file as they are made, which
-    ``holotorch calibrate headset`` reads; its axes are RDF.
+    It is called with each pose, keeps the newest one, and returns the pose in the present frame: that of the file, if
+    there is one, and of the newest fit otherwise. All alignments are also written to a table beside the file as they
+    are made, which ``holotorch calibrate headset`` reads; its axes are RDF.
 
     Args:
         out: File for the map, see ``devices.HeadsetSettings``. An existing one is used until it is replaced, and kept
@@ -72,7 +72,7 @@ class Aligner:
         return self.frame(pose)
 
     def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Take a message of a page and return what to tell it.
+        """Process a message of a page and return the answer.
 
         The message is ``aligned`` with the ``tip`` [3] in metres and the ``direction`` [3] of the virtual catheter in
         the headset's frame, ``undo`` for the last alignment, or ``save``. The answer has the number of alignments, a

@@ -26,7 +26,7 @@ from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender, 
 
 _LOOPBACK = "127.0.0.1"
 _EVERY = 50  # every 50th packet carries a refusal instead of a pose
-_SOON = 5e-3  # seconds: largest accepted median delay to a page; a quarter of that of the slowest per cent
+_SOON = 5e-3  # seconds: largest accepted median delay to a page; a quarter of the accepted 99th percentile
 _PICTURE = 0.1  # seconds: largest accepted median delay of a picture to a page
 _GROWTH = 100_000  # bytes by which the server may grow
 _FAST = 1e-3  # seconds: largest accepted median transit on the loopback
@@ -128,7 +128,7 @@ async def _page(count: int) -> tuple[bool, str]:
 async def _panel(count: int) -> tuple[bool, str]:
     """Whether 1080p pictures at 30 per second reach a page on this computer in time, and the added latency in words.
 
-    It holds the encoding and the transfer; what a browser takes to decode and draw is shown on its page.
+    The latency includes encoding and transfer; a browser shows on its page how long it decodes and draws.
     """
     from aiohttp import ClientSession
 
@@ -230,7 +230,7 @@ def _lossy(receiver: PoseReceiver, relay: "Relay") -> tuple[bool, str]:
     """Whether the receiver counted as the relay did and kept the newest packet, and the result in words."""
     counts = receiver.statistics
     dropped, overtaken, repeated = relay.dropped, relay.overtaken, relay.repeated
-    text = f"lossy way: of {relay.came} packets {dropped} lost, {overtaken} reordered, {repeated} twice"
+    text = f"lossy path: of {relay.came} packets {dropped} lost, {overtaken} reordered, {repeated} twice"
     counted = (counts.received, counts.reordered, counts.duplicated)
     expected = (relay.came - dropped, overtaken, repeated)
     if counted == expected and receiver.packet is not None and receiver.packet.sequence == relay.newest:

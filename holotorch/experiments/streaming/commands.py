@@ -19,12 +19,12 @@ def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     stream.add_argument("--headset", type=Path, metavar="FILE", help="send poses in its frame; see calibrate headset")
     stream.add_argument("--igtl", type=_port, metavar="PORT", help="serve OpenIGTLink, such as on 18944")
     stream.add_argument("--rate", type=float, metavar="HZ", help="poses per second of a poses.csv, or of pictures")
-    stream.add_argument("--smooth", action="store_true", help="One-Euro filter; packets tell its lag")
+    stream.add_argument("--smooth", action="store_true", help="One-Euro filter; packets state its lag")
     about = "with a source: a page that shows the poses in a browser; without: print what arrives by UDP"
     stream.add_argument("--view", action="store_true", help=about)
     stream.add_argument("--replay", type=Path, metavar="DIR", help="a run of track as the source, again and again")
     stream.add_argument("--page", metavar="HOST[:PORT]", help="where the page is served (default: 127.0.0.1:8765)")
-    about = "let a user of the page align the camera with a headset, and write its place there (headset.yaml)"
+    about = "let a user of the page align the camera with a headset, and write its position to FILE (headset.yaml)"
     stream.add_argument("--align", type=Path, metavar="FILE", help=about)
     stream.add_argument(
         "--volume", type=Path, metavar="FILE", help="registered volume: the page shows slices at the tip"
@@ -33,7 +33,7 @@ def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     stream.add_argument("--panel", metavar="SOURCE", help=about)
     stream.add_argument("--tls", nargs=2, type=Path, metavar=("CERT", "KEY"), help="for a page on another computer")
     stream.add_argument("--check", action="store_true", help="send to this machine itself, also with losses, and count")
-    about = "how many packets --check sends (default: 1000); with many its line memory tells more"
+    about = "how many packets --check sends (default: 1000); more of them make its test of the memory more sensitive"
     stream.add_argument("--packets", type=_count, metavar="N", help=about)
     stream.add_argument("--port", type=_port, default=18950, help="where --view and --check listen (default: 18950)")
     stream.set_defaults(action=_stream)

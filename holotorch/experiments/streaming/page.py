@@ -248,7 +248,7 @@ class _Client:
         self._wake.set()
 
     async def write(self) -> None:
-        """Send until the page goes, or takes nothing for too long."""
+        """Send until the page closes, or accepts nothing for too long."""
         while not self.socket.closed:
             await self._wake.wait()
             self._wake.clear()

@@ -64,7 +64,7 @@ class Encoder:
 
 
 class PanelSource:
-    """Plays a video source at its own pace, a file again and again, and hands each picture with its time of capture on.
+    """Plays a video source at its frame rate, a file repeatedly, and passes on each picture with its capture time.
 
     Args:
         source: A video, a folder of pictures, the number of a camera, or ``PATTERN``, a bar that moves through 1920 x

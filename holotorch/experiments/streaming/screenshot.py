@@ -62,7 +62,7 @@ async def _taken(run: Path, pose: Pose, frame: Tensor | None) -> bytes:
                 if frame is not None:
                     server.see(frame, pose, now())
                 await asyncio.sleep(0.1)
-            for _ in range(4):  # the words of the page follow ten times a second
+            for _ in range(4):  # the text of the page is updated ten times a second
                 server.send(pose, now())
                 await asyncio.sleep(0.05)
             taken = await tab.call("Page.captureScreenshot")

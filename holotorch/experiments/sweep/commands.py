@@ -6,7 +6,7 @@ from pathlib import Path
 
 def add_sweep(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command to the parser of ``holotorch``."""
-    about = "a grid of runs: key=a,b,c for each swept setting; a second call does what is missing"
+    about = "a grid of runs: key=a,b,c for each swept setting; a second call continues it"
     usage = (
         "holotorch sweep CONFIG key=a,b,c [key=value ...] [--jobs N | --slurm [key=value ...]] [--out DIR] [--check]"
     )

@@ -16,7 +16,7 @@ Task = tuple[str, tuple[str, ...], Path]  # configuration, overrides, folder
 
 
 def here(tasks: Sequence[Task]) -> Iterator[Outcome]:
-    """One run after the other in this process, which an interruption of a run ends."""
+    """One run after the other in this process; an interruption ends all of them."""
     for task in tasks:
         outcome = carry_out(*task, None)
         yield outcome
@@ -35,7 +35,7 @@ def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
     executor = get_reusable_executor(max_workers=jobs, env={"OMP_NUM_THREADS": str(threads)}, reuse=False)  # type: ignore[arg-type]
 
     def pass_on(number: int, _: Any) -> None:
-        """Runs at work save what they have and end; those that wait find the file and do not begin."""
+        """Active runs save their results and end; waiting ones find the file STOP and do not begin."""
         first = not stop.exists()
         stop.touch()
         for process in list(executor._processes) if first else ():  # the terminal sends Ctrl-C to them as well
@@ -48,7 +48,7 @@ def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
             for future in as_completed(futures):
                 try:
                     yield future.result()
-                except Exception as error:  # a process that ends takes the waiting runs with it
+                except Exception as error:  # if a process is killed, the waiting runs fail as well
                     status = INTERRUPTED if stop.exists() else FAILED
                     yield Outcome(futures[future], status, f"its process ended: {type(error).__name__}")
     finally:
@@ -59,7 +59,7 @@ def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
 def on_a_cluster(tasks: Sequence[Task], options: Sequence[str]) -> Iterator[Outcome]:
     """A Slurm job for each run, through submitit; ``options`` are its parameters, key=value, such as timeout_min=60.
 
-    ``cluster=local`` runs the jobs on this computer instead. An interruption leaves the jobs at work.
+    ``cluster=local`` runs the jobs on this computer instead. After an interruption, the jobs go on.
     """
     try:
         import submitit
@@ -91,7 +91,7 @@ def on_a_cluster(tasks: Sequence[Task], options: Sequence[str]) -> Iterator[Outc
 
 
 def engine(jobs: int, slurm: Sequence[str] | None) -> Callable[[Sequence[Task]], Iterator[Outcome]]:
-    """The engine that the options of the command ask for."""
+    """The engine for the options of the command."""
     if slurm is not None:
         return partial(on_a_cluster, options=slurm)
     return here if jobs == 1 else partial(side_by_side, jobs=jobs)

@@ -1,4 +1,4 @@
-"""One run of a sweep, in whatever process it is carried out."""
+"""One run of a sweep, in any process."""
 
 import contextlib
 import os
@@ -14,7 +14,7 @@ COMPLETE, INTERRUPTED, FAILED = "complete", "interrupted", "failed"
 
 
 class Outcome(NamedTuple):
-    """What became of a run."""
+    """Result of a run."""
 
     name: str
     status: str  # "complete", "interrupted" or "failed"

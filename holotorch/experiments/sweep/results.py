@@ -15,7 +15,7 @@ from holotorch.experiments.sweep.points import Point
 from holotorch.io.files import read_json, write_bytes
 
 TABLE, PICTURE, PAGE = "sweep.csv", "sweep.png", "report.html"
-# What a picture shows, by the last part of a column's name: the first of these that vary.
+# Quantities to draw, by the last part of a column's name: the first of these that vary between runs.
 _MERITS = ("ssim_mean", "ssim", "psnr_mean", "psnr", "psnr_db", "contrast", "error", "loss", "seconds")
 _PANELS = 3
 
@@ -41,7 +41,7 @@ def write_results(out: Path, points: Sequence[Point], statuses: dict[str, str]) 
 
 
 def draw(out: Path, points: Sequence[Point], summaries: dict[str, dict[str, Any]]) -> bytes | None:
-    """PNG of up to three numbers against the first swept key, a line for each combination of the others, or None."""
+    """PNG of up to three quantities against the first swept key, with a line for each value of the others, or None."""
     key = next(iter(points[0].values))
     places = [_number(out / point.name, key) for point in points]
     ticks = list(dict.fromkeys(point.values[key] for point in points))
@@ -91,7 +91,7 @@ def _flat(value: Any, name: str = "") -> list[tuple[str, Any]]:
 
 
 def _merits(summaries: Sequence[dict[str, Any]]) -> list[str]:
-    """Columns to draw: numbers that vary, in the order of ``_MERITS``, rather of the result than of a baseline."""
+    """Columns to draw: one for each of ``_MERITS`` that varies, of the result rather than of a baseline."""
     found = []
     for ending in _MERITS:
         named = [name for name in summaries[0] if name.rpartition(".")[2] == ending]

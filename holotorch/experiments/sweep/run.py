@@ -39,7 +39,7 @@ def check_sweep(config: str, words: Sequence[str]) -> str:
 def run_sweep(
     config: str, words: Sequence[str], out: Path, *, jobs: int = 1, slurm: Sequence[str] | None = None
 ) -> int:
-    """Carry out what is missing of a sweep, write its table, picture and page, and return the exit status.
+    """Carry out the missing runs of a sweep, write its table, picture and page, and return the exit status.
 
     It is 0 if all runs are complete, 1 if any failed, 130 after an interruption. ConfigError, before any run begins,
     with the mistakes of all runs, or for a folder that holds other runs.
@@ -68,7 +68,7 @@ def run_sweep(
     print(f"{len(grid)} runs: " + ", ".join(f"{count} {status}" for status, count in counts.items()))
     print(out / (PAGE if counts[COMPLETE] else TABLE))
     if interrupted or counts[INTERRUPTED] or counts["missing"]:
-        print("interrupted; the same command does what is missing", file=sys.stderr)
+        print("interrupted; the same command continues the sweep", file=sys.stderr)
         return 130
     return 1 if counts[FAILED] else 0
 
@@ -87,7 +87,7 @@ def _validated(config: str, grid: Sequence[Point]) -> list[Any]:
 
 
 def _complete(folder: Path, settings: Any) -> bool:
-    """Whether a folder holds the complete run of these settings; ConfigError if it holds that of others."""
+    """Whether a folder holds the complete run of these settings; ConfigError if its run has other ones."""
     if not finished(folder):
         return False
     try:

@@ -87,7 +87,7 @@ def axes_matrix(axes: str) -> Tensor:
 
 
 def alignment_text(alignment: Alignment, headset: Tensor) -> str:
-    """What an alignment is worth, in words: residuals, prediction of new poses, and what to do about it."""
+    """Quality of an alignment, in words: residuals, prediction of new poses, and what to do about it."""
     left_out = alignment.leave_one_out
     expected = float(_tip_deviation(alignment, headset))
     lines = [

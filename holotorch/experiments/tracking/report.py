@@ -30,7 +30,7 @@ COLUMNS = (
     *("chi_square", "freedom", "milliseconds"),
 )
 
-_STATED = "what the frames leave open; not what is unknown of the camera (its calibration) and of the catheter's edges"
+_STATED = "the uncertainty from the frames alone, without that of the calibration of the camera and of the band edges"
 _MOVED = 3.0  # largest spread of the tips of a resting catheter, as a multiple of the tracker's standard deviation
 _SHOWN = 4  # number of statuses whose first frame the page shows
 
@@ -184,7 +184,7 @@ def track_section(record: RunRecord) -> list[str]:
 
 def _truth(truth: dict[str, float]) -> str:
     """HTML of the distances between the tips and the truth of a synthetic recording."""
-    text = f"The recording is synthetic, and where the tip truly is is known. Of {truth['frames']} frames with a pose "
+    text = f"The recording is synthetic, so the true tip is known. Of {truth['frames']} frames with a pose "
     text = element("p", text + f"{truth.get('wrong', 0)} are wrong by more than 5 mm.")
     lengths = {name: length for name in ("median", "p95", "worst") if (length := truth.get(f"{name}_mm")) is not None}
     rows = [[f"{name} (mm)", f"{length:.3f}"] for name, length in lengths.items()]

@@ -135,6 +135,6 @@ def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:
     unsure = lens.calibration.deviations.get("fx", 0.0) / lens.fx if lens.calibration else 0.0
     if unsure > SURE:
         frames.notes.append(
-            f"the camera's calibration leaves its focal length open to {100 * unsure:.1f} %: tips are as far off along "
-            "the line of sight, in all frames alike, and no deviation below says so"
+            f"the camera's calibration determines its focal length only to {100 * unsure:.1f} %: tips are as far off "
+            "along the line of sight, in all frames alike, which the deviations below exclude"
         )

@@ -46,15 +46,15 @@ def _opened(path: Path, camera: Camera, board: Chessboard | Charuco) -> Photogra
 
 
 def real_pixels(photographs: Sequence[Photograph], poses: int) -> tuple[list[Row], bytes, list[str]]:
-    """What the trackers make of photographs with and without the catheter.
+    """Outcomes of the trackers on photographs with and without the catheter.
 
     Args:
         photographs: Photographs of boards.
         poses: Number of poses of the catheter in each.
 
     Returns:
-        A row for each photograph and method, a sheet of the photographs with the true and the found tip as PNG, and
-        lines of text.
+        A row for each photograph and method, a PNG of the photographs with the true and the estimated tip, and lines
+        of text.
     """
     rows, shown, everything = [], [], list[Answer]()
     for photograph in tqdm(photographs, "real pixels", unit="photo", dynamic_ncols=True):
@@ -94,7 +94,7 @@ def _row(photograph: Photograph, pixels: Pixels, method: str, own: Sequence[Answ
 
 
 def _noise_levels(photograph: Photograph, pixels: Pixels) -> float:
-    """Standard deviation of the noise in 8-bit levels at half of the white."""
+    """Standard deviation of the noise in 8-bit levels, at half the light of white squares."""
     light = 0.5 * max(pixels.white)
     spread = math.sqrt(pixels.shot_noise * light + pixels.read_noise**2)
     low, high = photograph.camera.levels(
@@ -118,7 +118,7 @@ def _lines(own: Sequence[Answer]) -> Iterator[str]:
 
 
 def _sheet(shown: Sequence[tuple[Photograph, Case, Answer]]) -> bytes:
-    """PNG of a frame of each photograph with the true tip as a circle, and the found one as a cross."""
+    """PNG of a frame of each photograph with the true tip as a circle, and the estimated one as a cross."""
     columns = min(4, len(shown))
     rows = math.ceil(len(shown) / columns)
     figure = Figure(figsize=(4.8 * columns, 3.9 * rows), layout="constrained")

@@ -1,4 +1,4 @@
-"""``holotorch view DIR --check``: how fast the pictures follow each control, beside two bare transforms."""
+"""``holotorch view DIR --check``: time of the pictures for each control, compared with two bare transforms."""
 
 import time
 from collections.abc import Callable
@@ -18,7 +18,7 @@ def check(viewer: Viewer, show: Callable[[str], None] = print) -> None:
     """Print the pictures per second while a control moves, and the seconds of a picture at rest, for each control."""
     start = checked(viewer.controls, {})
     with torch.no_grad():
-        viewer.show(start, False, _proceed)  # what is kept from the first picture
+        viewer.show(start, False, _proceed)  # fills the caches
         for control in viewer.controls:
             if isinstance(control, Slider):
                 each = [control.low + (control.high - control.low) * (0.3 + 0.05 * k) for k in range(2 * _PICTURES)]
@@ -48,4 +48,4 @@ def _bare_seconds(viewer: Viewer) -> float:
 
 
 def _proceed() -> None:
-    """Nothing replaces these pictures."""
+    """Do nothing, since no request replaces these pictures."""

@@ -1,4 +1,4 @@
-"""From the folder of a run to its viewer."""
+"""Opens the viewer of a finished run."""
 
 from importlib import import_module
 from pathlib import Path

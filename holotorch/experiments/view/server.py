@@ -101,7 +101,7 @@ class ViewServer:
             request = await page.next()
 
             def proceed(request: dict[str, Any] = request) -> None:
-                # Coarse pictures are finished even so: a user who never rests would otherwise see none.
+                # Coarse pictures are always finished, as otherwise none would appear while a control moves.
                 if self._closing or page.gone or (page.waiting and not request["coarse"]):
                     raise Outdated
 

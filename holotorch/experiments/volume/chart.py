@@ -36,11 +36,11 @@ AXIAL = "axial nodes, 3e-3"
 
 @dataclass(frozen=True)
 class Amount:
-    """Size of the measurement. A hologram of fewer pixels than WHOLE has its scene nearer, and fewer planes."""
+    """Size of the measurement. With fewer pixels than WHOLE, the scene is nearer and has fewer planes."""
 
     side: int = 512  # pixels along each side of a hologram
     scenes: tuple[str, ...] = tuple(TABLE)
-    all_planes: tuple[str, ...] = ("Tooth", "Teapot", "Hand", "Bonsai")  # also with all planes, and with WHOLE pixels
+    all_planes: tuple[str, ...] = ("Tooth", "Teapot", "Hand", "Bonsai")  # measured with all planes and WHOLE pixels too
     planes: tuple[int, ...] = (58, 145, 290, 580, 1160)
     sides: tuple[int, ...] = (256, 512, 1024, 2048)
     distances: tuple[int, ...] = (20, 40, 60, 80, 120, 160)  # mm, of a hologram of WHOLE pixels
@@ -149,7 +149,7 @@ def _calls(scene: Scene, wavelength: float) -> dict[str, Callable[[], Any]]:
 
 
 def _methods(amount: Amount) -> list[dict]:
-    """Rows of every scene at a part of its size and planes in 3 colours; of some with all planes in one colour."""
+    """Rows of every scene, reduced in size and planes, in 3 colours; of some with all planes in one colour."""
     rows, part = [], WHOLE // amount.side
     near = {name: mm / 1e3 / part for name, (mm, _, _) in TABLE.items()}
     cases = [(name, near[name], TABLE[name][1] // part, WAVELENGTHS) for name in amount.scenes]

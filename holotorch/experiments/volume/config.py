@@ -93,7 +93,7 @@ class TransferSettings(Settings):
 class ScatteringSettings(Settings):
     """Light that the volume scatters once, see ``holotorch.scene.Scattering``; the light comes from ``towards``.
 
-    ``half_angle_deg``: between the middle of the light and its edge. ``samples``: number of random directions.
+    ``half_angle_deg``: angle between the middle and the edge of the light. ``samples``: number of random directions.
     """
 
     towards: tuple[Number, Number, Number] = (-1.0, -0.5, -0.5)
@@ -128,7 +128,7 @@ class HologramSettings(GridSettings):
 
     ``rays`` is the number of rays along each side, by default one per pixel. ``cone`` is the type of the edge of a
     point's cone of light, see ``holotorch.hologram.cone``; by default the cheapest soft edge. ``tolerance``: allowed
-    relative L2 error of the field; by default the share of the tolerance of the run, or 1e-3 if that has none.
+    relative L2 error of the field; by default a share of the tolerance of the run, or 1e-3 if the run has none.
     """
 
     distance: Depth
@@ -141,7 +141,7 @@ class HologramSettings(GridSettings):
 class VolumeReport(Settings):
     """Depths of the refocused pictures, and number of realisations of the random phases to average.
 
-    The default depths are the 10, 50 and 90 % quantiles of the depths that the rays show.
+    The default depths are the 10, 50 and 90 % quantiles of the depths of the visible rays.
     """
 
     refocus: Annotated[tuple[Depth, ...], BeforeValidator(several)] | None = None
@@ -157,7 +157,7 @@ class VolumeSettings(Settings):
     and a given number of planes, which makes a small version of a scene. Three wavelengths show red, green and blue of
     the volume; a single one shows their mean; of two, the longer one shows the mean of red and green, the shorter one
     that of green and blue. ``tolerance``: allowed relative L2 error of
-    the refocused fields, divided between the hologram and its refocusing; without it they err by 1e-3 and 3e-3.
+    the refocused fields, divided between the hologram and its refocusing; without it, the two may err by 1e-3 and 3e-3.
     """
 
     experiment: Literal["volume"]

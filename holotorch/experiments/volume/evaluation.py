@@ -101,7 +101,7 @@ class VolumeEvaluation:
         return table
 
     def _speckle_contrast(self, pictures: Tensor) -> float | None:
-        """Standard deviation over mean of the ratio of the sharpest picture to the rendering, where that is bright."""
+        """Standard deviation over mean of the ratio of the sharpest picture to the rendering, at bright pixels."""
         bright = self.rendering > _BRIGHT * self.rendering.max()
         if not bright.any():
             return None

@@ -33,7 +33,7 @@ from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
 _CATALOGUE = {"teapot": "boston_teapot"}  # names of the thesis that differ from those of the catalogue
-_COUNTED = 1_000_000  # voxels of the histogram at most
+_COUNTED = 1_000_000  # largest number of voxels in the histogram
 HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the tolerance of a run
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
@@ -137,7 +137,7 @@ class VolumeExperiment:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Precision of the fields: complex128 if a tolerance is closer to the rounding of complex64 than 10 times."""
+        """Precision of the fields: complex128 if a tolerance is below 10 times the rounding error of complex64."""
         asked = self.settings.tolerance, self.settings.hologram.tolerance
         least = min((each for each in asked if each is not None), default=1.0)
         return torch.complex128 if least < _SINGLE else torch.complex64
@@ -150,7 +150,7 @@ class VolumeExperiment:
 
     @cached_property
     def preset_range(self) -> tuple[float, float] | None:
-        """Values between which a preset lies that the configuration leaves open, from the histogram; None otherwise."""
+        """Range of a preset, from the histogram, if the configuration does not state it; None otherwise."""
         transfer = self.settings.transfer
         if transfer.preset is None or transfer.low is not None:
             return None
@@ -182,7 +182,7 @@ class VolumeExperiment:
             lighting=self._lighting(),
             phase=phases[self.settings.phase],
         )
-        sampler.checks_slabs = False  # the plan tells the error
+        sampler.checks_slabs = False  # the plan states the error
         return sampler
 
     def rendering(self) -> tuple[Tensor, Tensor]:
@@ -205,7 +205,7 @@ class VolumeExperiment:
             rotation=self.rotation,
             lighting=self._lighting() if lit else None,
         )
-        sampler.checks_slabs = False  # the plan tells the error
+        sampler.checks_slabs = False  # the plan states the error
         with torch.no_grad():
             return sampler.render(self.volume)[0][: len(self.settings.wavelengths)].cpu()
 
@@ -299,7 +299,7 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
 
 
 def open_volume(source: VolumeSource) -> tuple[Volume, str]:
-    """The volume, and why it is a phantom, which is empty for real data. ConfigError if it cannot be read."""
+    """The volume, and the reason why it is a phantom, "" for real data. ConfigError if it cannot be read."""
     spacing = source.spacing[0] if source.spacing and len(source.spacing) == 1 else source.spacing
     try:
         if source.path:
@@ -326,9 +326,10 @@ def open_volume(source: VolumeSource) -> tuple[Volume, str]:
 
 
 def _shared(transfer: TransferFunction, wavelengths: Sequence[float]) -> TransferFunction:
-    """The transfer function with a channel for each wavelength in place of red, green and blue, and copies after it.
+    """The transfer function with a channel for each wavelength in place of red, green and blue.
 
-    Compositing is linear in the colours, so that mixing them here mixes those of the rendering.
+    Compositing is linear in the colours, so they are mixed before the rendering instead of after it. With fewer than
+    three wavelengths, the last channel is repeated.
     """
     if (shares := _SHOWN.get(len(wavelengths))) is None:
         return transfer

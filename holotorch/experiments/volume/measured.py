@@ -21,7 +21,7 @@ _TIGHT = 1e-7  # tolerance of the reference of refocusing
 
 
 def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Comparison:
-    """Error of the colour with the largest predicted one, for the light of its brightest planes.
+    """Error of the colour with the largest predicted error, for the light of its brightest planes.
 
     Their hologram by the method of the plan is compared with a convolution of each plane in complex128.
 
@@ -97,6 +97,6 @@ def _brightest(experiment: VolumeExperiment, colour: int, count: int) -> list[tu
 
 
 def relative_error(field: Tensor, exact: Tensor) -> float:
-    """Relative L2 error; 0 if both are dark."""
+    """Relative L2 error; 0 if both are 0."""
     norm = exact.norm().item()
     return (field - exact).norm().item() / norm if norm else 0.0

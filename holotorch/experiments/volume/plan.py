@@ -17,17 +17,17 @@ from holotorch.scene import DVRSampler
 FLOP_SECONDS = 5.7e-11  # seconds per operation of a HologramPlan
 _RAY_SECONDS = 2.5e-8  # seconds of rendering per ray and plane
 _FIELD_SECONDS = 1e-8  # seconds / (n log2 n) to refocus a field of n samples
-_CALL_SECONDS = 0.015  # seconds to plan that
+_CALL_SECONDS = 0.015  # seconds to plan the refocusing of a field
 _PICTURE_SECONDS = 2.4e-6  # seconds to score a pixel of a picture, encode it and draw it in a figure
 _BASE_BYTES = 500e6  # memory of the libraries
 _RAY_BYTES = 120  # memory of the renderer per ray
-_COARSE_SLABS = 0.1  # predicted error of a rendering that is noted
+_COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
 _LIT, _DARK = (
     0.05,
     0.1,
-)  # value from which a ray is not black, and share of such rays below which a picture is mostly so
+)  # value above which a ray is not black, and share of such rays below which a picture counts as mostly black
 
 
 def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def rendering_seconds(experiment: VolumeExperiment, machine: Machine) -> float:
 
 
 def _evaluation_seconds(experiment: VolumeExperiment, machine: Machine) -> dict[str, float]:
-    """Seconds for what follows the holograms, by its name."""
+    """Seconds of each step after the holograms, by name."""
     depths, pixels = len(experiment.refocus) or 3, math.prod(experiment.grid.shape)
     field = _FIELD_SECONDS * pixels * math.log2(pixels) * machine.fft(pixels) + _CALL_SECONDS * machine.interpreter
     pictures = _PICTURE_SECONDS * math.prod(experiment.rays.shape) * (depths + 2) * machine.interpreter
@@ -141,7 +141,7 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
 
 
 def colours_in_words(wavelengths: Sequence[float]) -> list[str]:
-    """What each wavelength shows of the colours of the volume, as a line of a plan; none for three wavelengths."""
+    """Line of a plan that says which colours each wavelength shows; none for three wavelengths."""
     if len(wavelengths) == 3:
         return []
     names = [f"{wavelength * 1e9:.0f} nm" for wavelength in sorted(wavelengths, reverse=True)]
@@ -167,7 +167,7 @@ def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
 
 
 def preset_note(experiment: VolumeExperiment) -> str:
-    """Where a preset lies whose values the configuration leaves open; empty for any other transfer function."""
+    """Range of a preset that the configuration does not state; empty for any other transfer function."""
     if experiment.preset_range is None:
         return ""
     low, high = experiment.preset_range
@@ -206,7 +206,7 @@ def _shallow(experiment: VolumeExperiment) -> list[str]:
 
 
 def dark_picture(experiment: VolumeExperiment) -> list[str]:
-    """A warning if most of the rendering is black, from a coarse one; otherwise none."""
+    """A warning if most of a coarse rendering is black; otherwise none."""
     share = (experiment.quick_rendering(_COARSE, lit=False).amax(0) > _LIT).double().mean().item()
     if share >= _DARK:
         return []

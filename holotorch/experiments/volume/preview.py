@@ -8,9 +8,9 @@ from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.runs.pictures import in_colour
 from holotorch.experiments.volume.experiment import VolumeExperiment
 
-_SIDE = 256  # pixels of the rendering along each side at most
-_SAMPLE = 1_000_000  # voxels that are counted at most
-_SHARES = (1, 25, 50, 75, 90, 95, 99, 99.9)  # percentiles that are told
+_SIDE = 256  # largest number of pixels of the rendering along each side
+_SAMPLE = 1_000_000  # largest number of voxels in the histogram
+_SHARES = (1, 25, 50, 75, 90, 95, 99, 99.9)  # percentiles that are listed
 
 
 def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:

@@ -24,9 +24,9 @@ def file_routes(folder: Path, headers: Mapping[str, str]) -> list[web.RouteDef]:
 async def listening(
     app: web.Application, host: str, port: int, context: ssl.SSLContext | None = None
 ) -> tuple[web.AppRunner, int]:
-    """Serve ``app``; returns what ends that by ``cleanup()``, and the port, which ``port`` 0 leaves to the system.
+    """Serve ``app``; returns the runner, whose ``cleanup()`` ends it, and the port.
 
-    OSError if the port cannot be used.
+    With ``port`` 0 the system chooses one. OSError if the port cannot be used.
     """
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
     await runner.setup()

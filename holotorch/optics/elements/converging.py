@@ -149,9 +149,9 @@ class ConvergingFresnel(FieldOperator):
         if self.beyond_fresnel > _TRUSTED:
             warnings.warn(
                 f"ConvergingFresnel over {self.distance:g} m with a focus of {self.focus:g} m leaves out a phase of up "
-                f"to {self.beyond_fresnel:.2g} rad for the steepest ray that reaches the result, which is not to be "
-                f"trusted beyond that; {_TRUSTED} rad is small. A longer focus and distance, a smaller window or a "
-                "coarser pitch lessen it; AngularSpectrum on samples fine enough for the lens has none of it",
+                f"to {self.beyond_fresnel:.2g} rad for the steepest ray that reaches the result, which is "
+                f"accurate up to {_TRUSTED} rad. A longer focus and distance, a smaller window or a coarser pitch "
+                "reduce this phase; AngularSpectrum includes it, on samples fine enough for the lens",
                 SamplingWarning,
                 stacklevel=2,
             )

@@ -22,7 +22,7 @@ class CroppedKernel(DistanceFilter):
     displacements that occur inside the window, it gives a linear convolution by FFTs of twice the window. A sampled
     transfer function would wrap around or remove the light that leaves the window. The factor beyond Fresnel, the exact
     transfer function divided by the paraxial one, is applied in frequency. It moves light at an angle a by
-    z (tan a - sin a), a few samples, for which the padding has room.
+    z (tan a - sin a), a few samples, which the padding allows for.
 
     For fields of random phase the relative L2 error is at most about 2 s^2 / sqrt(N) at every distance, with
     s the sine of the steepest angle, wavelength / (2 pitch), and N the samples of an axis: with 512 samples, 1e-4 for a
@@ -31,7 +31,7 @@ class CroppedKernel(DistanceFilter):
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.
         distance: In metres, negative for backward propagation. Wavelengths [C] and distance may be ``nn.Parameter``;
-            the transfer function is then computed in every call, and has room for twice the given distance.
+            the transfer function is then computed in every call, with padding for up to twice the given distance.
         paraxial: Leave out the factor beyond Fresnel.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field, which need not be
             a whole number of samples.

@@ -1,4 +1,4 @@
-"""The impulse response of free space, exact for band-limited samples, unlike that of a sampled transfer function."""
+"""Impulse response of free space, exact for band-limited samples, and the factor beyond the Fresnel model."""
 
 import math
 
@@ -64,7 +64,7 @@ def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tenso
     cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
     cycles = -distance / wavelength * torch.where(travels, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
     phase = turns_phasor(cycles)
-    # Reading the answer back from a GPU, or without values, costs more than the factor or is impossible.
+    # Without evanescent waves there is no decay. This check is too slow on a GPU, and impossible under compile.
     if sine2.device.type == "cpu" and not torch.compiler.is_compiling() and not bool((sine2 > 1).any()):
         return phase
     _, imaginary = direction_cosine(sine2)
@@ -99,8 +99,8 @@ def levelling_shift(
     """Shift along ``axis`` in metres, shape [...], moved from the factor beyond Fresnel into the taps of that axis.
 
     About a tilted carrier this factor has an odd part, which is discontinuous between the two ends of the periodic
-    band. The shift makes the phase at both ends equal for the rms frequency of the other axis, which leaves a fifth of
-    the discontinuity. ``nyquist`` is the highest frequency (y, x) of the samples, in cycles per metre.
+    band. The shift makes the phase at both ends equal for the rms frequency of the other axis; a fifth of
+    the discontinuity remains. ``nyquist`` is the highest frequency (y, x) of the samples, in cycles per metre.
     """
     ends = [torch.full((), limit / 3**0.5, dtype=torch.float64, device=tilt.device) for limit in nyquist]
     cycles = []

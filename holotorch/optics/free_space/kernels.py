@@ -54,8 +54,8 @@ def angular_spectrum_kernel(
     kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(cycles)
     if not band_limit:
         return kernel
-    # tan(angle) = wavelength f / cos. Of the evanescent waves, the same limit drops those next to the cut-off, which
-    # decay slowly but vary too fast with frequency to be sampled.
+    # tan(angle) = wavelength f / cos. The same limit drops evanescent waves next to the cut-off, which decay
+    # slowly but vary too fast with frequency to be sampled.
     root = cosine + imaginary
     height, width = grid.extent
     twice_product = 2 * (distance * wavelength).abs()

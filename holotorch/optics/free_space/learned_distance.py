@@ -28,7 +28,7 @@ Differentiable = Callable[[Tensor, Tensor], Tensor]  # from wavelength and dista
 
 
 def has_closed_form(planes: PlanePair, wavelength: Tensor, distance: Tensor) -> bool:
-    """Whether :func:`times_learned` applies: only one distance is learned, between planes that face.
+    """Whether :func:`times_learned` applies: one learned distance, and equal samples on both planes.
 
     Forward mode, transforms of ``torch.func``, ``torch.compile`` and GPUs, where the checks of values would be slow or
     impossible, are left to autograd.

@@ -13,7 +13,7 @@ from holotorch.core.grid import Grid, Pair
 
 @dataclass(frozen=True)
 class PlanePair:
-    """Source grid, result grid, and the direction of the carrier wave by which the fields on both are divided.
+    """Source grid, result grid, and the direction of the carrier wave that is divided out of both fields.
 
     Attributes:
         grid: Sampling of the source.

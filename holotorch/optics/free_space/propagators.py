@@ -18,7 +18,7 @@ from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.geometry import least_padding
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
 
-_NEGLECTED = 2.0  # rad: phase beyond Fresnel at the corner of the band that makes noise err by half (measured)
+_NEGLECTED = 2.0  # rad: neglected phase at the corner of the band for which the error of noise is half (measured)
 
 
 class SpectralFilter(FieldOperator):
@@ -70,8 +70,8 @@ class SpectralFilter(FieldOperator):
 class DistanceFilter(SpectralFilter):
     """A :class:`SpectralFilter` whose transfer function follows from wavelengths and a distance, which may be learned.
 
-    The function is kept in complex64, for complex64 fields, and computed anew for complex128 fields, of which the
-    last one is kept. If wavelengths or distance are learned, it is computed in every call.
+    The function is stored in complex64 for complex64 fields. For complex128 fields it is computed at the first
+    call and then kept. If wavelengths or distance are learned, it is computed in every call.
 
     Args:
         grid, wavelengths, out_grid: As for :class:`FieldOperator`; wavelengths, [C], may be an ``nn.Parameter``.

@@ -40,8 +40,8 @@ def transfer_function(
         padded: Grid of the FFTs. After the inverse FFT, the first samples are those of ``planes.out``.
         wavelength: In metres, float64, shape [...].
         distance: In metres, float64, shape [...] that broadcasts; 0 gives the identity.
-        sampled: Per axis (y, x): True to sample the paraxial factor in frequency, False to transform its exact taps,
-            cropped to the length of the transform.
+        sampled: Per axis (y, x): True to sample the paraxial factor in frequency, False for the FFT of its exact
+            taps, cropped to the length of the FFT.
         paraxial: Leave out the factor beyond Fresnel.
         tilt: Sines (y, x) of the carrier, float64 [2], for gradients; those of ``planes`` by default.
         dtype: Of the result; phases are computed in float64 in any case.
@@ -62,7 +62,7 @@ def transfer_function(
         for frequency, pitch, position in zip((fy, fx), padded.pitch, positions, strict=True):
             cycles = cycles + frequency * pitch * position[..., None, None]
         return turns_phasor(cycles).to(dtype) * carrier_factor[..., None, None]
-    shifts_beyond = []  # per axis, in samples, moved from the factor beyond Fresnel into the taps
+    shifts_beyond = []  # of each axis, in samples: the part of the shift that moves into the taps
     if tilted:
         nyquist = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
         for axis in (0, 1):

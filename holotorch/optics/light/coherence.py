@@ -8,7 +8,7 @@ from holotorch.optics.light.quadrature import correlation
 from holotorch.optics.light.spectrum import Spectrum
 
 # Focal shift by half the optimum width, in depths of focus: fitted to the CT scan of a teapot, three colours at 10, 20
-# and 30 mm. Scenes that it was not fitted to ask for 0.47 (CT scan of a bonsai), 0.67 (a tooth) and 0.84 (a molecule).
+# and 30 mm. Optimum of other scenes: 0.47 (CT scan of a bonsai), 0.67 (a tooth) and 0.84 (a molecule).
 DEFOCUS = 0.47
 
 

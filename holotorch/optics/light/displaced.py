@@ -1,4 +1,4 @@
-"""An eye beside the axis: the field that shows an eye on the axis what the displaced eye sees."""
+"""An eye beside the axis, simulated by a tilt and shift of the field for an eye on the axis."""
 
 from torch import Tensor
 from torch.nn import functional

@@ -77,8 +77,8 @@ class SpeckleIntegral:
     def error(self, positions: Tensor, shares: Tensor) -> Tensor:
         """Expected rms error of a rule with nodes ``positions`` and weights ``shares``, relative to the rms intensity.
 
-        The expectation is over fully developed speckle whose intensities correlate as in :func:`correlation`, around
-        the mean brightness that the iris transmits.
+        The expectation is over fully developed speckle with the correlation of :func:`correlation` and a mean
+        brightness proportional to the transmission of the iris.
         """
         energy = self.weights @ self._second_moment(self.nodes, self.nodes) @ self.weights
         return (self._squared_error(energy, positions, shares).clamp_min(0) / energy).sqrt()
@@ -134,7 +134,7 @@ class SpeckleIntegral:
         return rule
 
     def _descend(self, start: Tensor) -> tuple[Tensor, Tensor]:
-        """Rule of locally least error, by L-BFGS from nodes ``start`` within -1..1, to which the band is scaled."""
+        """Rule at a local minimum of the error, by L-BFGS from nodes ``start``; the band is scaled to -1..1."""
         hidden = torch.atanh(start).clone().requires_grad_()
         energy = self.weights @ self._second_moment(self.nodes, self.nodes) @ self.weights
         search = torch.optim.LBFGS([hidden], max_iter=60, line_search_fn="strong_wolfe", tolerance_change=1e-12)
@@ -162,7 +162,7 @@ class SpeckleIntegral:
         return energy - 2 * cross + shares @ self._second_moment(positions, positions) @ shares
 
     def _best_weights(self, positions: Tensor) -> Tensor:
-        """Weights of least error for given nodes. Their sum is 1, so that brightness without speckle is exact."""
+        """Weights of least error for given nodes. Their sum is 1, which is exact for an intensity without speckle."""
         count = len(positions)
         identity, ones = torch.eye(count, dtype=positions.dtype), positions.new_ones(count, 1)
         top = torch.cat([self._second_moment(positions, positions) + _JITTER * identity, ones], 1)

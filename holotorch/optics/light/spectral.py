@@ -66,8 +66,8 @@ def neighbours(
     centre = checks.wavelengths(wavelength)[0]
     if inseparable(grid, centre, display, eye):
         raise ValueError(
-            "the errors of this eye cannot be set anew for another wavelength, since its pupil takes more than the "
-            "band of the grid; follow every wavelength, or use a smaller pupil or a finer grid"
+            "the aberrations of this eye cannot be replaced by those at another wavelength, since its pupil transmits "
+            "more than the band of the grid; propagate every wavelength, or use a smaller pupil or a finer grid"
         )
     plane = display.focus_plane(eye.accommodation)
     first, second, _, _ = display.matrix(plane)

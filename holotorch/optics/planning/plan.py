@@ -32,10 +32,10 @@ def plan_propagation(
 ) -> Plan:
     """Choose how to propagate a field over ``distance``, without propagating it.
 
-    The arguments have the meaning, units and defaults of those of ``propagate``, apart from these. A plan for several
-    wavelengths or distances serves all of them. ``field`` is an example of the content, complex [..., H, W], which is
-    measured and replaces the description by ``band``, ``spread`` and ``margin``. ``dtype``, complex64 or complex128,
-    is that of the fields to propagate. A plan that needs more than ``memory_limit`` bytes per channel is refused.
+    Arguments that are not described here are those of ``propagate``. A plan for several wavelengths or distances is
+    for all of them together. ``field`` is an example of the content, complex [..., H, W], which is measured and
+    replaces the description by ``band``, ``spread`` and ``margin``. ``dtype`` is the type of the fields to propagate,
+    complex64 or complex128. A plan that needs more than ``memory_limit`` bytes per channel is refused.
 
     Raises:
         ValueError: An argument outside its range, or a plan that needs more than ``memory_limit``; the message says
@@ -65,7 +65,7 @@ def plan_from(
             "coarser grid"
         )
     if second is None:
-        runner_up = "no other way was considered"
+        runner_up = "no other method was considered"
     elif second.cost > best.cost:
         ratio = second.cost / max(best.cost, 1)
         runner_up = f"{second.label} lost by its cost, {ratio:.2f} times as much arithmetic"
@@ -74,7 +74,7 @@ def plan_from(
     adequate = best.error <= tolerance
     verdict = "the cheapest adequate" if adequate else "the most accurate, though not adequate,"
     reason = (
-        f"{best.label} is {verdict} of {len(options)} ways: predicted error {best.error:.1e} for a tolerance of "
+        f"{best.label} is {verdict} of {len(options)} candidates: predicted error {best.error:.1e} for a tolerance of "
         f"{tolerance:.1e}"
     )
     pad = best.padded[0] / planes.grid.shape[0], best.padded[1] / planes.grid.shape[1]

@@ -336,7 +336,7 @@ def _chosen(
     learned: bool,
     **described: tuple[float, float] | None,
 ) -> Candidate:
-    """The best candidate for the light that ``example`` is, or that band, spread and margin describe without one."""
+    """The best candidate for content as ``described`` (band, spread and margin) or, if given, as in ``example``."""
     checks.positive("tolerance", tolerance)
     if learned and planes.straight:  # the error of such a method grows with the distance
         distances = [next_longer(each) for each in distances]
@@ -366,7 +366,7 @@ def next_longer(distance: float) -> float:
 
 
 def _handed(plan: Plan, planes: PlanePair) -> Method:
-    """The method of a plan that was handed in; TypeError if it is none, ValueError if it is for other planes."""
+    """The method of a plan; TypeError if it is no plan, ValueError if it is for other planes."""
     if not isinstance(plan, Plan):
         raise TypeError(f"plan must be a result of plan_propagation, got {type(plan).__name__}")
     window = planes.out.shape, planes.out.pitch, planes.offset
@@ -431,13 +431,13 @@ def _warn_if_dim(
 
     ``norms`` are the L2 norms [...] of the fields at the source; if they are None, nothing is checked.
     """
-    if norms is None or 0 in result.shape or best.error > tolerance:  # _best has warned of the last case
+    if norms is None or 0 in result.shape or best.error > tolerance:  # _accept has warned of the last case
         return
-    # No light at the source counts as light that arrives.
+    # A dark source gives 0 / 0, which counts as 1 so that it causes no warning.
     least = torch.nan_to_num(_norms(result) / norms, nan=1.0).min().item()
     dimmest = least**2 * math.prod(planes.out.pitch) / math.prod(planes.grid.pitch)
     allowed = _DIM_ERROR * tolerance
-    # Most calls end here: the expected light is at most all light, and takes longer to compute.
+    # Most calls end here: the expected fraction of the light is at most 1, and computing it takes longer.
     if best.error <= allowed * math.sqrt(dimmest):
         return
     expected = 1.0 if measured and dimmest < _DIM else best.captured()

@@ -202,7 +202,7 @@ def collapse_sampling(
         for wavelength in wavelengths:
             accepted = radius / (wavelength * abs(second))
             if accepted > _ROOM / (2 * pitch):
-                # The pupil transmits frequencies above 1 / (2 pitch), which the sampling must hold too.
+                # The pupil transmits frequencies above 1 / (2 pitch), which the sampling must resolve too.
                 factor = max(factor, 2 * pitch * accepted)
             highest = 1 / (2 * pitch) + abs(first) * window * pitch / 2 / (wavelength * abs(second))
             factor = max(factor, _ROOM * pitch * (highest + accepted))
@@ -234,13 +234,13 @@ def _pair(values: Sequence[int]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class CollapseFactors:
-    """What multiplies the light of one wavelength on its way to the retina.
+    """Factors of the collapsed propagation of one wavelength.
 
     Attributes:
         kernel: Transfer function to the object plane, complex [P, Q] in FFT order.
         zoom: Factors (y, x) of the chirp-z transform to the oversampled object plane; empty without oversampling.
         curvature: Parabolic phase of the object plane, a column [h, 1] and a row [1, w].
-        pupil: Transmission of pupil, defocus and aberrations, complex [n, m], on the frequencies that the pupil takes.
+        pupil: Transmission of pupil, defocus and aberrations, complex [n, m], at frequencies within the pupil.
         bands: Number of bands (y, x) of width 1 / pitch among these frequencies.
     """
 

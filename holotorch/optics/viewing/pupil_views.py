@@ -1,4 +1,4 @@
-"""What an eye sees of a hologram through pupils and at focal distances of its own, without lenses: PupilViews."""
+"""PupilViews: fields of a hologram through distant pupils, each at its focal distance, without lenses."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ class View:
 
     Attributes:
         focus: Depth in metres behind the hologram (> 0; virtual images) or in front of it (< 0) that is sharp.
-        radius: Sine of the half-angle of the cone of light that the pupil accepts: for a far eye, the radius of the
+        radius: Sine of the half-angle of the cone of light that the pupil accepts: for a distant eye, the radius of the
             pupil over its distance. math.inf accepts all.
         centre: Sines (y, x) of the direction of the pupil's centre.
         covered: Vector (y, x) towards the half of the pupil that is covered, as by the edge of an eye box; (0, 0) if
@@ -53,7 +53,7 @@ class PupilViews(PreciseModule):
     Each view is the field propagated back to the focal distance, exactly, through a pupil far from the hologram, which
     selects directions: IFT P_v H_v FT. The forward transform is shared. The intensity of a result is the image on a
     retina whose eye has no aberrations, magnified back onto the pixels of the hologram. Pixels resolve this intensity
-    if the pupil is at most half as wide as their band; a wider pupil is sampled at the pixels.
+    if the pupil is at most half as wide as their band; for a wider pupil, they undersample it.
 
     Outside the window of the hologram the field is 0. The transforms are padded for the light within the pupils, at
     most over ``longest`` metres, so that it does not wrap around.
@@ -62,7 +62,7 @@ class PupilViews(PreciseModule):
         grid: Pixels of the hologram.
         wavelengths: In metres, one per channel.
         views: The views.
-        longest: Largest distance in metres for which the padding has room; by default that of the views.
+        longest: Largest distance in metres for which the padding suffices; by default that of the views.
 
     Raises:
         ValueError: No views; a pupil outside of the directions that the pixels can emit, or that contains none of the

@@ -20,14 +20,14 @@ from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
 from holotorch.optics.viewing.eye import Eye
 
-# Relative error of sampling the hard edge of a pupil, times the number of samples across its diameter. Measured by the
-# collapse: 1.1 to 3.2 for points (1360 samples) and 0.6 to 3.4 for noise (42 to 55 samples); measured by
+# Relative error of sampling the hard edge of a pupil, times the number of samples across its diameter. Measured for the
+# collapse: 1.1 to 3.2 for points (1360 samples) and 0.6 to 3.4 for noise (42 to 55 samples); measured for
 # element-by-element propagation: 0.4 to 1.3 (3800 samples).
 _EDGE_ERROR = 3.0
 _RAYS = 512  # rays across the pupil from each point of the scene that predict the error of the collapse
 _HEIGHTS = 9  # points of the scene that predict the error of the collapse
 _UNUSABLE = 0.5  # expected relative error above which a plan is refused
-TOLERANCE = 0.1  # relative error of the intensity accepted by default; most of the collapse's is a shift of spots
+TOLERANCE = 0.1  # relative error of the intensity accepted by default; that of the collapse is mostly a shift of spots
 _COSTLY = 10.0  # ratio of operations to those of the cheapest method above which a warning is given
 
 
@@ -79,13 +79,13 @@ def plan_retina(
         wavelengths: In metres, one per channel.
         display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina and accommodation.
-        tolerance: Largest accepted relative L2 error of the intensity. By default the cheapest method is taken, with an
-            error of 0.1 as the limit of what is called adequate.
+        tolerance: Largest accepted relative L2 error of the intensity. By default the cheapest method is taken, which
+            is called adequate if its error is at most 0.1.
         plane: Distance in metres from the hologram to the object plane; by default that of the plane in focus.
         reach: Half width in metres of the scene in the object plane; by default that of the hologram.
         paraxial: Predict errors in the Fresnel model, in which the eyepiece's edge and the sampling are the only errors
             of the collapse.
-        registered: Do not count as an error that parts of the image move by a fraction of a spot.
+        registered: Leave out errors that only move parts of the image by a fraction of a spot.
         dtype: Type of the field, complex64 or complex128.
         memory_limit: Exclude a method that needs more bytes than this for one image of one wavelength.
 
@@ -130,18 +130,18 @@ def plan_retina(
 
 
 def _choice(options: list[RetinaPlan], tolerance: float | None, limit: float) -> tuple[RetinaPlan, RetinaPlan]:
-    """The best of the plans within ``limit`` bytes, as :func:`plan_retina` says, and the cheapest one."""
+    """The plan within ``limit`` bytes that :func:`plan_retina` returns, and the cheapest one."""
     fitting = [each for each in options if each.memory_bytes <= limit]
     if not fitting:
         raise ValueError(
-            f"no way to the retina fits into {limit:.3g} bytes, the smallest takes "
+            f"no method fits into {limit:.3g} bytes, the smallest takes "
             f"{min(each.memory_bytes for each in options):.3g}; crop the hologram or raise memory_limit"
         )
     usable = [each for each in fitting if each.predicted_error <= _UNUSABLE]
     if not usable:
         best = min(fitting, key=lambda each: each.predicted_error)
         raise ValueError(
-            f"the only way that fits, {best.method}, has an expected error of {best.predicted_error:.2g}; raise "
+            f"the only method that fits, {best.method}, has an expected error of {best.predicted_error:.2g}; raise "
             "memory_limit, or make the scene smaller (reach)"
         )
     cheapest = min(usable, key=lambda each: each.flops)
@@ -240,7 +240,7 @@ class Retina(PreciseModule):
     Args:
         grid, wavelengths, display, eye, plane, paraxial: As in :func:`propagate_collapsed`.
         tolerance: Largest accepted relative L2 error of the intensity. By default the cheapest method, which a training
-            loop can afford; a warning says if its expected error exceeds 0.1, and what a better one costs.
+            loop can afford; if its expected error exceeds 0.1, a warning states the cost of a better one.
         options: ``reach``, ``registered``, ``dtype`` and ``memory_limit`` of :func:`plan_retina`.
 
     Attributes:

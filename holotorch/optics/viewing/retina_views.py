@@ -1,4 +1,4 @@
-"""RetinaViews: what the same eye sees of a display at several foci, as one image of a correction problem."""
+"""RetinaViews: images of a display on several retinas, such as one eye at several foci, for a correction problem."""
 
 from collections.abc import Sequence
 

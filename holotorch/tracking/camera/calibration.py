@@ -108,15 +108,15 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
     if len(kept) >= _CHECKED:
         if coverage.between < math.radians(10):
             raise ValueError(
-                f"all boards are parallel to within {math.degrees(coverage.between):.1f} degrees, which leaves the "
-                "focal length open; tilt the board by 20 to 45 degrees to several sides"
+                f"all boards are parallel to within {math.degrees(coverage.between):.1f} degrees, which does not "
+                "determine the focal length; tilt the board by 20 to 45 degrees to several sides"
             )
         fit = fit._replace(deviations=np.maximum(fit.formal, _jackknife(kept, size, fit)))
     relative = float(max(fit.deviations[:2] / fit.values[:2]))
     if not relative <= 0.2:
         raise ValueError(
-            f"the views leave the focal length open to {100 * relative:.0f} % (one standard deviation); tilt the board "
-            "by 20 to 45 degrees to several sides and fill the picture with it"
+            f"the views determine the focal length only to {100 * relative:.0f} % (one standard deviation); tilt the "
+            "board by 20 to 45 degrees to several sides and fill the picture with it"
         )
     camera = Camera(torch.from_numpy(camera_matrix(fit.values)), torch.from_numpy(fit.values[4:].copy()), size=size)
     weights = np.array([len(view.points) for view in kept])
@@ -205,8 +205,8 @@ def _warnings(
     count, scatter, (height, width) = len(errors), float(np.median(errors)), size
     corners = torch.tensor([[0.0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=torch.float64)
     warnings = {
-        f"Too few views to check one another ({count}): what is open is taken from ordinary cameras, which is a start "
-        f"and no measurement. Take {_ADVISED} or more.": count < _CHECKED,
+        f"Too few views to check one another ({count}): the rest is assumed as for ordinary cameras, "
+        f"too inaccurate for measurements. Take {_ADVISED} or more.": count < _CHECKED,
         f"Only {count} views: take {_ADVISED} or more.": _CHECKED <= count < _ADVISED,
         f"The focal length is known to {100 * relative:.1f} % only: at 0.5 m that may move a tip by "
         f"{500 * relative:.1f} mm. Take more views, tilted by 20 to 45 degrees to several sides.": relative > SURE,
@@ -218,7 +218,7 @@ def _warnings(
         f"The boards differ by {math.degrees(coverage.between):.0f} degrees at most: tilt the board more, to several "
         "sides.": count > 1 and coverage.between < math.radians(25),
         f"The corners scatter by {scatter:.1f} px: is the board flat, the picture sharp?": scatter > 1,
-        "The fitted distortion cannot be inverted in the picture's corners: no answers from there.": bool(
+        "The fitted distortion cannot be inverted in the picture's corners: no poses there.": bool(
             camera.undistort(corners).isnan().any()
         ),
     }

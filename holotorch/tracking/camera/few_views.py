@@ -57,7 +57,7 @@ def estimate(views: Sequence[View], size: tuple[int, int]) -> Estimate:
     worst = int(contradiction.argmax())
     if contradiction[worst] > 3:
         raise ValueError(
-            f"so few views are completed by what ordinary cameras are like, and these contradict it: {_TRAITS[worst]} "
+            f"so few views are fitted with a prior for ordinary cameras, which they contradict: {_TRAITS[worst]} "
             f"by {contradiction[worst]:.1f} deviations; is the board's shape right, the photograph not cropped, the "
             "lens no fisheye? If so, take 10 or more, which determine any camera"
         )

@@ -16,8 +16,8 @@ from scipy.special import erf
 from holotorch.tracking.detection.fits import BLUNTEST, SHARPEST, median
 
 _STEPS = 8  # largest number of Gauss-Newton steps
-_SETTLED = 0.03  # pixels: steps of middle and blur at convergence; the next steps would be a third
-_WIDENED = 0.15  # pixels: steps of width and taper at convergence; the next steps would be a fifth
+_SETTLED = 0.03  # pixels: steps of middle and blur at convergence; the next ones would be a third as large
+_WIDENED = 0.15  # pixels: steps of width and taper at convergence; the next ones would be a fifth as large
 _FARTHEST = np.array([1.5, 1.5, 1.5, 1.5, 0.5])  # pixels: largest step of middle (2), width (2) and blur
 _SLICES = 8  # slices across the tube, each of constant shading
 _SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)  # of positions -1 to 1

@@ -115,9 +115,9 @@ def ambiguity_text(orders: Sequence[ChannelOrder]) -> str:
     """Message for the user about ambiguous orders, with a remedy; empty if there are none."""
     names = " or ".join(order.value for order in orders)
     return names and (
-        f"frames with channels in the order {names} show this catheter's bands as another pose, with a small stated "
-        "deviation, and only the tube beyond its bands tells, where it is on the frame: make sure that what is red is "
-        "red in the frames, or paint bands that no exchange of channels makes the same, as in "
+        f"frames with channels in the order {names} show this catheter in another pose, with a small stated "
+        "deviation, which only the tube beyond the bands can refute, if it is on the frame: make sure that red objects "
+        "are red in the frames, or paint bands whose colours differ in every order of the channels, as in "
         "configs/tracking/catheter_distinct.yaml"
     )
 

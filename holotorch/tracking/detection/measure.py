@@ -234,7 +234,7 @@ def measure_edges(
     texture = np.zeros(len(guess))
     covered, beyond, texture[chosen] = _across(beside, along - fit.place[:, None], fit)
     if beyond and len(near) > 2 and median(fit.blur) < blur + BLURRED:
-        text = "all bands go on beside the tube: this is thicker, seen in one part of it"
+        text = "all bands continue beside the tube: the object is thicker than the catheter"
         raise Refusal(Status.INCONSISTENT, text, final=True)
     within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
     clear = (fit.deviation < _LIMITS.vague) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
@@ -354,8 +354,8 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     """Whether the background changes at the edges, from ``fit`` and the background rows ``light`` [E, T, 6, C].
 
     ``along`` [E, T] are the positions of the samples relative to the edges. Returns [E] whether the background changes
-    on both sides, so that something lies across the tube; whether on one side, and still a few pixels away, the
-    background at all edges changes like the tube; and [E] the rms variation of the background along the tube, as a
+    on both sides, so that something lies across the tube; whether the background on one side, even a few pixels away,
+    changes like the tube at all edges; and [E] the rms variation of the background along the tube, as a
     fraction of the tube's change.
     """
     count, samples, _, colours = light.shape

@@ -21,14 +21,14 @@ class StationPlan:
     most: int = 8  # stations of a tube of ordinary width
     fewest: int = 6  # stations of a wide tube
     samples: int = 16  # neighbouring lines across the tube that are averaged for one station to reduce noise
-    most_across: int = 700  # samples across the tube of all stations together, which limits the stations of wide tubes
+    most_across: int = 700  # samples across the tube in all stations together; it limits the stations of wide tubes
 
 
 @dataclass(frozen=True)
 class AxisLimits:
     """Limits for refusing the fit of an axis, and an error floor; determined on synthetic frames."""
 
-    one_sided: float = 0.15  # least ratio of the smaller to the larger contrast of the tube to its two sides
+    one_sided: float = 0.15  # least ratio of the contrasts of the tube to its two sides, smaller over larger
     narrowest: float = 2.4  # least width in pixels; in a narrower tube no pixel shows the colour of one band alone
     moving: float = 3.0  # largest change of the middle in the last step of a converged fit, in pixels
     floor: float = 0.002  # error of the axis in widths, from gloss and shadow that are constant along the tube
@@ -45,7 +45,7 @@ class WidthFit:
 
 
 STATION_PLAN, _LIMITS, _WIDTH = StationPlan(), AxisLimits(), WidthFit()
-THIRD = 0.35  # relative deviation of the prior for a width that is unknown
+THIRD = 0.35  # relative deviation of the prior for an unknown width
 _LEVEL_SD = 2.5 / 255  # assumed standard deviation of a pixel's level; fits rescale it by their residuals
 
 
@@ -183,9 +183,9 @@ def measure_width(
 ) -> tuple[Stations, Axis, Axis]:
     """Stations, axis with the expected width, and a second axis with an independently measured width, for checks.
 
-    ``stations`` gave ``axis`` with the expected width ``wide`` (pixels at t = 0, taper per pixel) of relative standard
-    deviation ``known``. If the tube extends beyond them, ``look`` samples stations again for a width and a blur in
-    pixels, before and after the measurement of the width.
+    ``axis`` is the fit to ``stations`` with the expected width ``wide`` (pixels at t = 0, taper per pixel) of relative
+    standard deviation ``known``. ``look`` samples stations for a width and a blur in pixels; it is called before and
+    after the measurement of the width if the tube extends beyond the stations.
 
     Raises:
         Refusal: As :func:`look_across` and :func:`measure_axis`.

@@ -94,7 +94,7 @@ class SearchLimits:
 
 _FLOORS, _CHECK, _SEARCH = ErrorFloors(), WidthCheck(), SearchLimits()
 _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
-_EXCHANGED = "a frame whose red and blue are exchanged looks so; state the order of its channels (ChannelOrder)"
+_EXCHANGED = "exchanged red and blue channels can cause this; state the order of the channels (ChannelOrder)"
 
 
 class CatheterTracker(nn.Module):
@@ -281,7 +281,7 @@ class CatheterTracker(nn.Module):
             reach = min(0.15, 2 * aside / half) if onward else 0.06
             line, stretches = find_bands(sampler, self.lens, line, self.table, half, aside, reach, onward=onward)
         if stretches.known < least:
-            few = "a band hides, is drowned by its surroundings or leaves the frame"
+            few = "a band is hidden, has the colour of its surroundings or leaves the frame"
             text = f"{stretches.known} edges of bands are seen, {least} are needed: {few}"
             raise Refusal(Status.BANDS_MISSING, text, turned=stretches.turned)
         return line, stretches

@@ -11,8 +11,8 @@ from holotorch.tracking.pose.status import Pose
 
 # Limits of the prediction, those of the page of ``holotorch stream --view``.
 LONGEST_GAP = 0.25  # seconds between the two poses that give a speed
-LONGEST_AHEAD = 0.1  # seconds; a later time of display is shown as if it were this one
-_LONGEST_STEP = 2.5  # median intervals between two frames between which a true tip is interpolated
+LONGEST_AHEAD = 0.1  # seconds; a later display shows the prediction for this time
+_LONGEST_STEP = 2.5  # longest gap across which a true tip is interpolated, in median intervals
 METHODS = ("none", "constant velocity", "one euro")
 
 
@@ -76,7 +76,7 @@ def _interpolated(times: Tensor, poses: Sequence[Pose], wanted: Tensor) -> Tenso
     after = torch.searchsorted(times, wanted).clamp(1, len(times) - 1)
     interval = times[after] - times[after - 1]
     share = ((wanted - times[after - 1]) / interval)[:, None]
-    # At a frame itself the neighbour does not count, even if it was refused.
+    # At the time of a frame, its neighbour has no weight and may have been refused.
     value = torch.where(share == 1, tips[after], tips[after - 1] + share * (tips[after] - tips[after - 1]))
     value = torch.where(share == 0, tips[after - 1], value)
     known = (wanted <= times[-1]) & ((interval <= _LONGEST_STEP * times.diff().median()) | (share[:, 0] == 1))

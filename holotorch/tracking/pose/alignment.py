@@ -27,8 +27,8 @@ class Alignment:
         leave_one_out: [n] residual of each alignment for the map fitted to all others, which predicts the error of a
             new alignment. Infinite where the others do not determine a map.
         covariance: float64 [6, 6] of the map in the headset's frame, (turn about its origin in radians, shift in
-            metres), without gradient. It is estimated from the residuals, for alignments that err in the place of the
-            tool and in its direction, and widened for their small number.
+            metres), without gradient. It is estimated from the residuals, for alignments with errors in the position
+            of the tool and in its direction, and widened for their small number.
     """
 
     headset_from_camera: Tensor
@@ -87,7 +87,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
     if len(source) < 3:
         raise ValueError(
             f"an alignment needs 3 poses of the tool or more, not parallel to each other, got {len(source)}; one "
-            "leaves the turn about the tool open"
+            "does not determine the rotation about the tool"
         )
     first, second = ((part[:, 1] - part[:, 0]).detach().norm(dim=-1) for part in points)
     worst = int((first - second).abs().argmax())
@@ -100,7 +100,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
         if (spread := _spread(part)) < SAME_DIRECTION:
             raise ValueError(
                 f"the alignments are parallel to within {math.degrees(spread):.1f} degrees in the {name}'s frame, "
-                "which leaves the turn about the tool nearly open; hold the tool in different directions, 45 degrees "
+                "which hardly determines the rotation about the tool; hold the tool in directions that are 45 degrees "
                 "apart or more"
             )
     fitted = rigid_map(source, target)
@@ -144,7 +144,7 @@ def in_frame(pose: Pose, matrix: Tensor, covariance: Tensor | None = None) -> Po
 
 
 def _covariance(fitted: Tensor, source: Tensor, target: Tensor) -> Tensor:
-    """Covariance of ``Alignment``: two variances explain the residuals, of the place of the tool and of its direction.
+    """Covariance of ``Alignment``: two variances explain the residuals, of the position and of the direction.
 
     With the residuals r = M e of the errors e, and Cov(e) = a S_a + b S_b, the expected squares of the residuals of the
     tip, and of the difference of both points, are linear in a and b.
@@ -171,7 +171,7 @@ def _covariance(fitted: Tensor, source: Tensor, target: Tensor) -> Tensor:
     expected = torch.stack([torch.stack([(each * cause).sum() for cause in spread]) for each in (tip, difference)])
     observed = torch.stack([residual @ each @ residual for each in (tip, difference)])
     variances = torch.linalg.solve(expected, observed)
-    if bool((variances < 0).any()):  # one cause explains all
+    if bool((variances < 0).any()):  # one variance suffices
         other = int(variances.argmax())
         variances = torch.zeros_like(variances)
         variances[other] = observed.sum() / expected[:, other].sum()

@@ -101,8 +101,8 @@ def fit_band_edges(
     if bool(failed) or not bool((deviations <= 5e-4).all()):  # half a millimetre: a ruler is more accurate
         worst = "" if bool(failed) else f" (edge {int(deviations.argmax())} to {1e3 * float(deviations.max()):.1f} mm)"
         raise ValueError(
-            f"the frames leave the positions open{worst}: take more of them, nearer to the camera, tilted toward it "
-            "and away from it by 20 to 45 degrees"
+            f"the frames do not determine the positions{worst}: take more of them, nearer to the camera, tilted toward "
+            "it and away from it by 20 to 45 degrees"
         )
     tip, _, positions = state
     return BandEdges(positions, covariance, chi_square, freedom, tip[0] if resting_tip else None)
@@ -225,5 +225,5 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
     _, values, vectors = torch.linalg.svd(rows)
     rank = int((values > 1e-9).sum())
     if rank == count:
-        raise ValueError("all positions are given, nothing is left to be found; name fewer in known")
+        raise ValueError("all positions are known, so none is left to be fitted; name fewer in known")
     return vectors[rank:].mT

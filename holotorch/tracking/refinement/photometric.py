@@ -21,8 +21,8 @@ class FitPlan:
     """
 
     along: int = 8  # pixels to each side of an edge, along the image axis nearer to the tube's direction
-    widest: int = 30  # most pixels to each side of the tube's axis, along the other image axis
-    beside: float = 3.0  # background beside the tube that counts: more of it helps no more and is less uniform
+    widest: int = 30  # largest number of pixels to each side of the tube's axis, along the other image axis
+    beside: float = 3.0  # width of the fitted background beside the tube; more does not help and is less uniform
     margin: float = 8.0  # least distance of an edge from the border of the frame: its window must show both sides
     degree: int = 4  # degree of the shading across the tube: higher ones leave the position across less certain
     density: float = 1.6  # nodes of the quadrature over the tube's width, per pixel of it: 1e-4 of the light at least
@@ -35,7 +35,7 @@ class FitPlan:
     smeared: float = 2.0  # ratio of the squared residuals of chroma to those of luma above which chroma is coarse
     chroma: float = 0.15  # weight of a level of coarse chroma relative to luma: enough to tell the colours apart
     stretch: float = 1.2  # ratio of the blurs along and across the tube that is tried to find a motion
-    stretch_gain: float = 10.0  # log-likelihood that this must gain before a fit with a motion is tried
+    stretch_gain: float = 10.0  # gain in log-likelihood by this ratio above which a fit with a motion is tried
     wide: float = 0.95  # blur above which a fit with a motion is tried, too
     motion_gain: float = 150.0  # log-likelihood that a motion must gain; defocus alone gains up to 110
     edge_floor: float = 0.012  # error of an inner edge along the tube: shading and sampling
@@ -47,17 +47,17 @@ class FitPlan:
     motion_floor: float = 0.01  # additional error of edge and axis per pixel of motion
     radius_spread: float = 0.02  # standard deviation of the logarithm of the radius: blur and shading at the sides
     readout: float = 2e-4  # metres, standard deviation of a hand's motion while a rolling shutter reads; 0: global
-    step: float = 2.0  # most pixels that a step moves an edge
-    reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it: the window must show it
-    unsure: float = 0.3  # standard deviation of an edge from noise alone above which there is none: 0.5 without edges
+    step: float = 2.0  # largest shift of an edge in one step
+    reach: float = 6.0  # largest distance of an edge from its place in the rough pose, so that the window contains it
+    unsure: float = 0.3  # deviation of an edge due to noise above which a window shows no edge; 0.5 without one
     inconsistent: float = 12.0  # sum of the squares of shifts over their deviations above which the edges disagree
-    iterations: int = 20  # most Gauss-Newton steps
+    iterations: int = 20  # largest number of Gauss-Newton steps
     settled: float = 0.2  # step in standard deviations of the result below which a fit ends
 
 
 @dataclass(frozen=True, eq=False)
 class PhotometricPose:
-    """Fitted poses of B frames, with what each of the N edges says about them.
+    """Fitted poses of B frames, with the misfit and shift of each of the N edges.
 
     Attributes:
         tip: [B, 3], in metres; NaN where the fit has not converged.
@@ -66,7 +66,7 @@ class PhotometricPose:
         blur: [B] standard deviation of the point spread, in pixels.
         misfit: [B, N] mean squared residual of each edge's window in squared levels.
         shift: [B, N] of each edge along the tube relative to the fitted pose, in metres.
-        shift_sd: [B, N] standard deviation of this shift, had the pose not been fitted to the edge.
+        shift_sd: [B, N] standard deviation of this shift, if the pose were not fitted to this edge.
         used: [B, N] whether the edge's window is on the frame.
     """
 
@@ -175,16 +175,16 @@ class _Fit:
 class PhotometricFit(nn.Module):
     """Refines poses by fitting the light of the pixels around each band edge.
 
-    Each pixel near an edge is modelled as the light of a cylinder with two bands, blurred by a Gaussian, before two
+    Each pixel is modelled as the light of a cylinder with two bands, blurred by a Gaussian, in front of two
     backgrounds. Position, direction and blur are found by Gauss-Newton steps with an analytic Jacobian; all colours and
     the shading across the tube are linear and are eliminated in each step (variable projection). The cylinder is exact
     in the space of rays, so that the rings' curvature and the lens's distortion need no correction, and pixels are used
-    as they are, without interpolation. Each window may shift a little on its own: by what no noise explains.
+    as they are, without interpolation. Each window may shift by errors that noise does not explain.
 
-    The noise is estimated from the residuals: of each channel, of the tube and of the background apart, and as far as
-    the residuals of neighbouring pixels agree. Where chroma has a lower resolution than luma (4:2:0 video, JPEG), luma
-    is fitted. Where another blur along the tube than across it fits better, a uniform motion during the exposure is
-    tried. A rolling shutter cannot be told from another pose: state ``readout`` in the plan.
+    The noise is estimated from the residuals for each channel, separately for the tube and the background, with
+    correlations of neighbouring pixels. Where chroma has a lower resolution than luma (4:2:0 video, JPEG), luma
+    is fitted. Where different blurs along and across the tube fit better, a uniform motion during the exposure is
+    tried. A rolling shutter cannot be distinguished from another pose: state ``readout`` in the plan.
 
     The result is differentiable with respect to the frames, the camera and the catheter, by the implicit function
     theorem at the optimum.
@@ -298,7 +298,7 @@ class PhotometricFit(nn.Module):
         return both.take(best * count + twice[:count])
 
     def _stretched(self, fit: _Fit, windows: Windows) -> Tensor:
-        """[B] whether another blur along the tube than across it fits better: a motion during the exposure."""
+        """[B] whether different blurs along and across the tube fit better: a motion during the exposure."""
         count, twice = len(fit.unknown), torch.arange(len(fit.unknown), device=fit.unknown.device).repeat(2)
         stretch = fit.unknown.new_full((2 * count, 1, 1), self.plan.stretch)
         stretch[count:] = 1 / self.plan.stretch
@@ -335,7 +335,7 @@ class PhotometricFit(nn.Module):
         return place, light
 
     def _within(self, frame: Frame, start: Frame) -> Tensor:
-        """[B] whether no edge is farther than ``reach`` from where it was in the rough pose."""
+        """[B] whether no edge is farther than ``reach`` from its position in the rough pose."""
         edges = (self.positions - self._middle())[:, None].detach()
         before, after = (self.camera.project(one.middle[:, None] + edges * one.axis[:, None]) for one in (start, frame))
         return ~((after - before).norm(dim=-1) > self.plan.reach).any(-1)
@@ -383,7 +383,7 @@ class PhotometricFit(nn.Module):
             miss = (across * tip[:, None, None]).sum(-1) / across.norm(dim=-1)
             depth = (tip[:, None] + self.positions[:, None] * direction[:, None]).norm(dim=-1)[..., None]
             near = miss.abs() < self.radius + self.plan.beside * depth * angle
-        # An edge counts if all of the frame around it is there; a saturated pixel does not.
+        # An edge is used if its surroundings are on the frame. Saturated pixels are not used.
         clear = (levels < _WHITE).all(2)
         x, y = pixels[:, :, pixels.shape[2] // 2].unbind(-1)
         margin = torch.minimum(torch.minimum(x, width - 1 - x), torch.minimum(y, height - 1 - y))
@@ -393,7 +393,7 @@ class PhotometricFit(nn.Module):
     def _coarse(self, frames: Tensor, pixels: Tensor) -> Tensor:
         """[B] whether red minus luma has less fine detail than luma around an edge: chroma at half resolution.
 
-        With independent noise in each channel it has 1.4 times as much, and a grey texture adds to luma alone.
+        With independent noise in each channel, red minus luma has 1.4 times as much; grey texture adds to luma alone.
         """
         height, width = frames.shape[-2:]
         if min(height, width) < _PATCH:
@@ -552,7 +552,7 @@ class PhotometricFit(nn.Module):
         return design, data.flatten(2)[:, :, None], mixes
 
     def _floor(self, place: TubeGeometry, unknown: Tensor, grain: Tensor, coarse: bool) -> Tensor:
-        """Standard deviations in metres of what no noise explains in each edge along and across the tube, [B, N, 2]."""
+        """Standard deviations [B, N, 2], in metres along and across the tube, of errors that noise does not explain."""
         plan, count = self.plan, len(self.positions)
         outer = torch.tensor([n in (0, count - 1) for n in range(count)], device=unknown.device)
         texture = torch.zeros_like(grain) if coarse else (plan.grain_floor * grain).square()

@@ -67,7 +67,7 @@ class Frame(Items):
         return Frame(middle, axis, side, torch.linalg.cross(side, axis), sight)
 
     def moved(self, unknown: Tensor) -> tuple["Frame", Tensor]:
-        """Frame after the shifts and turns of ``unknown`` [B, D], and what is left of it: 0 for the first five."""
+        """Frame after the shifts and turns of ``unknown`` [B, D], and the new ``unknown``, with 0 for these five."""
         shift = unknown[:, 0:1] * self.side + unknown[:, 1:2] * self.axis + unknown[:, 2:3] * self.sight
         turn = unknown[:, 3:4] * self.side + unknown[:, 4:5] * self.front
         blur = unknown[:, 5:6].clamp(math.log(0.25), math.log(8.0))
@@ -120,7 +120,7 @@ class TubeGeometry:
         along = depth * cosine - beside
         pixels = depth * windows.angle
         width = rest[:, 5].exp()[:, None, None]
-        point = (width**2 + 1 / 12).sqrt()  # with the square of a pixel, to second order
+        point = (width**2 + 1 / 12).sqrt()  # includes the square of a pixel, to second order
         zero = torch.zeros_like(cosine)
         depth_side, depth_sight = by_side * per_square, (by_sight - cosine * slope) * per_square
         common = (2 * cosine * depth - beside) * per_square
@@ -143,7 +143,7 @@ class TubeGeometry:
 
 @dataclass(frozen=True, eq=False)
 class TubeLight:
-    """Light of a blurred tube with two bands before two backgrounds, per unit of its K linear coefficients.
+    """Light of a blurred tube with two bands in front of two backgrounds, per unit of its K linear coefficients.
 
     The blur is a Gaussian, and with a motion during the exposure its mean over a line. The quadrature over the tube's
     width has M nodes; with a motion there are T nodes over the time of exposure, and the axis M counts M T nodes.

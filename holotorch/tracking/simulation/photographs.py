@@ -1,7 +1,7 @@
-"""Photographs of calibration boards, what they tell of their cameras, and the catheter rendered into them.
+"""Photographs of calibration boards, the blur and noise measured in them, and the catheter rendered into them.
 
-The background is real; the catheter is synthetic. The edges of a board's squares tell the blur, smooth patches the
-noise, and white squares the colour of the light.
+The background is real; the catheter is synthetic. Blur is measured at the edges of a board's squares, noise in smooth
+patches, and the colour of the light on white squares.
 """
 
 import math
@@ -26,9 +26,9 @@ from holotorch.tracking.simulation.varied import tip_deviation
 from holotorch.tracking.simulation.world import Case
 
 _PATCH = 8  # side of the patches whose noise is measured, in pixels
-_SMOOTH = 0.3  # fraction of the patches of a brightness that are taken for smooth
+_SMOOTH = 0.3  # fraction of the patches of a brightness that count as smooth
 _NEAR, _FAR = 0.16, 0.3  # metres: distances of the middle of the bands, for cameras of 640 x 480 pixels
-_VAGUE = 1e-3  # metres: poses whose tip edges of 0.05 pixels leave less certain are not drawn
+_VAGUE = 1e-3  # metres: largest standard deviation of the tip, for edges with errors of 0.05 pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Pixels:
-    """What a photograph says of its camera, in linear light of 0 to 1.
+    """Blur, noise and white of a photograph, in linear light of 0 to 1.
 
     Attributes:
         blur_px: Median standard deviation of the lens's blur at the edges of the board's squares in pixels, NaN without
@@ -90,7 +90,7 @@ def published_camera(files: Sequence[Path]) -> Camera:
 def drawn_photograph(
     blur_px: float = 0.8, shot_noise: float = 3e-4, read_noise: float = 4e-3, seed: int = 0
 ) -> Photograph:
-    """A synthetic photograph of a chessboard with known blur and noise: what there is without real photographs."""
+    """A synthetic photograph of a chessboard with known blur and noise, for use without real photographs."""
     rng, (height, width) = np.random.default_rng(seed), (480, 640)
     matrix = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(matrix, torch.zeros(5, dtype=torch.float64))
@@ -174,7 +174,7 @@ def _noise(light: np.ndarray) -> tuple[float, float]:
     order = np.argsort(mean)
     for part in np.array_split(order, max(1, min(12, len(order) // 100))):
         smooth = np.sort(variance[part])[: max(1, int(_SMOOTH * len(part)))]
-        # The smallest of equally noisy patches are below the mean by chance, by what a chi-square distribution says.
+        # By chance, the smallest variances of equally noisy patches are below the mean, by a known factor.
         levels.append(mean[part].mean())
         sums.append(smooth.mean() / _share_of_mean(_SMOOTH))
     design = np.stack([np.array(levels), np.ones(len(levels))], -1) / np.array(sums)[:, None]

@@ -2,7 +2,7 @@
 
 :mod:`~holotorch.tracking.simulation.render` draws the catheter on a finer grid and filters it. Here every pixel traces
 rays that are drawn from its square, the point spread function and the exposure, so that blur, defocus, motion and a
-rolling shutter need no kernels. The two share no code, and neither was written from a tracker's model.
+rolling shutter need no kernels. The two share no code, and neither uses the model of a tracker.
 """
 
 import math
@@ -17,7 +17,7 @@ from torch import Tensor
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
 
-_SAMPLES = 256  # rays of a pixel near the bands: their levels are then right to 0.6 (one sigma)
+_SAMPLES = 256  # rays of a pixel near the bands: the standard deviation of their levels is then 0.6
 _FEW = 32  # rays of a pixel near the rest of the catheter
 _BESIDE = 0.015  # metres beyond the bands with many rays
 _CHUNK = 4096  # pixels traced at a time
@@ -172,8 +172,8 @@ def _spread(light: np.ndarray, shot: Shot) -> np.ndarray:
 def _offsets(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> np.ndarray:
     """Rays of ``count`` pixels: x and y in pixels from the pixel's centre, and time -0.5 to 0.5; [count, S, 3].
 
-    All pixels use the same well-spread points, each shifted at random. The fewer dimensions, the better they spread:
-    the pixel's square and the lens's Gaussian are drawn as one, disc and time only where the shot has them.
+    All pixels use the same well-spread points, each shifted at random. Points in fewer dimensions are spread more
+    evenly: the sum of pixel square and lens Gaussian is one variable; disc and time are drawn only if present.
     """
     defocus, moves = shot.disc_px > 0, any(shot.motion)
     dimensions = 2 + 2 * defocus + moves
@@ -296,7 +296,7 @@ def _tube(shot: Shot, rays: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _cover_rest(light: np.ndarray, shot: Shot) -> None:
-    """Draw what is in front of the catheter where the catheter is not near, in place."""
+    """Draw the objects in front of the catheter on pixels that are not near the catheter, in place."""
     if not shot.before:
         return
     done = np.zeros(light.shape[:2], bool)

@@ -88,7 +88,7 @@ def gauze(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
 
 
 def steel(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
-    """Brushed metal that mirrors a room: streaks, bright and dark bands, tints of what stands around."""
+    """Brushed metal that mirrors a room: streaks, bright and dark bands, tints of objects around it."""
     angle = rng.uniform(0, math.pi)
     y, x = np.mgrid[: size[0], : size[1]].astype(np.float32)
     across = x * math.cos(angle) + y * math.sin(angle)

@@ -1,7 +1,7 @@
 """The second synthetic world: random scenes that no tracker was tuned on, with exact truth, by condition.
 
-A scene is determined by its seed. Seeds below 1000 (:data:`TUNING_SEEDS`) are for development; figures are measured
-with others. Nothing here depends on how a tracker works.
+A scene is determined by its seed. Seeds below 1000 (:data:`TUNING_SEEDS`) are for development; reported figures use
+others. Nothing here depends on how a tracker works.
 """
 
 import colorsys
@@ -51,7 +51,7 @@ CONDITIONS = (
 )
 NEGATIVES = ("no catheter", "other colours", "wrong order", "thicker", "near miss")
 _EDGE_SD = 0.05  # pixels: error of an edge that a good measurement reaches
-_VAGUE = 5e-4  # metres: poses whose tip is less certain with such edges say more about the view than about a tracker
+_VAGUE = 5e-4  # metres: largest standard deviation of the tip with such edges; beyond it, the view limits any tracker
 _MARGIN = 0.002  # metres that an edge must be clear of an occluder or the border to count as visible
 
 
@@ -112,7 +112,7 @@ class VariedWorld:
     photographs: tuple[Tensor, ...] = ()
 
     def trial(self, seed: int, condition: str | None = None) -> Trial:
-        """The scene of a seed; its condition is the seed's turn of :data:`CONDITIONS` unless one is named."""
+        """The scene of a seed; by default, the seeds take :data:`CONDITIONS` in turn."""
         condition = _named("condition", condition, CONDITIONS, checks.whole("seed", seed, 0))
         rng = np.random.default_rng([seed, *condition.encode()])
         shot = self._shot(rng, condition)
@@ -357,7 +357,7 @@ class VariedWorld:
 
 
 def _named(name: str, value: str | None, known: Sequence[str], seed: int) -> str:
-    """The ``value``, or without one the turn of ``seed`` among those ``known``."""
+    """The ``value``, or without one the entry of ``known`` at ``seed`` modulo their number."""
     if value is not None and value not in known:
         raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     return value or known[seed % len(known)]

@@ -40,14 +40,14 @@ def test_a_measured_gaussian_gives_what_its_sigma_gives(tmp_path, suffix, capsys
     plan = json.loads((tmp_path / "b" / "plan.json").read_text())["crosstalk"]
     assert plan["fitted_sigma_px"] == pytest.approx(0.66, abs=1e-3) and plan["fit_residual"] < 1e-3
     said = capsys.readouterr().out
-    assert "has sigma 0.66 px" in said and "no Gaussian stands for" not in said
+    assert "has sigma 0.66 px" in said and "no Gaussian represents" not in said
 
 
 def test_a_kernel_that_is_no_gaussian_is_said(tmp_path, capsys):
     y, x = np.mgrid[-3:4, -3:4]
     np.savetxt(tmp_path / "kernel.csv", np.exp(-np.hypot(y, x) / 0.6), delimiter=",")
     assert main(["check", *SMALL, f"modulator={{kernel: {tmp_path / 'kernel.csv'}}}"]) == 0
-    assert "(rms): no Gaussian stands for this kernel" in capsys.readouterr().out
+    assert "no Gaussian represents this kernel" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -305,8 +305,8 @@ def test_the_self_test_counts_what_its_bad_network_does():
     for name in ("receiver 1", "receiver 2"):
         assert f"OK    {name}: 150 of 150 packets, 3 refusals" in text
         assert f"{name}: added latency median " in text and f"OK    {name}: clock offset" in text
-    (lossy,) = [line for line in lines if "lossy way" in line]
-    assert lossy.startswith("OK    lossy way: of 150 packets ") and "the receiver counted the same" in lossy
+    (lossy,) = [line for line in lines if "lossy path" in line]
+    assert lossy.startswith("OK    lossy path: of 150 packets ") and "the receiver counted the same" in lossy
     dropped, overtaken = (int(lossy.split(word)[0].split()[-1]) for word in (" lost", " reordered"))
     # 150 draws of 20 %: 30 +- 4.9; of 10 %: 15 +- 3.7, a few of them let go with none in between.
     assert abs(dropped - 30) < 4 * 4.9 and 0 < overtaken <= 15 + 4 * 3.7

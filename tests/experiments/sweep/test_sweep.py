@@ -116,7 +116,7 @@ def test_an_interrupted_sweep_is_completed_to_the_same_table(toy, tmp_path, monk
         patch.setattr(ToyKind, "step", step)
         assert main(["sweep", toy, "steps=1,3,5", "--out", str(out)]) == 130
     assert [row["status"] for row in rows(out)] == ["complete", "interrupted", "missing"]
-    assert "the same command does what is missing" in capsys.readouterr().err
+    assert "the same command continues the sweep" in capsys.readouterr().err
     assert main(["sweep", toy, "steps=1,3,5", "--out", str(out)]) == 0
     assert (out / "sweep.csv").read_bytes() == (whole / "sweep.csv").read_bytes()
 

@@ -76,7 +76,7 @@ def test_an_alignment_that_slipped_is_named(tmp_path):
     ("values", "message"),
     [
         (alignments(2), "needs 3 poses"),
-        (alignments(6, spread=0.0), "hold the tool in different directions"),
+        (alignments(6, spread=0.0), "hold the tool in directions that are"),
         (alignments(6, axes="RUF"), "left-handed"),
         (torch.where(torch.arange(12) == 3, math.nan, alignments()), "direction"),
         (1e3 * alignments(), "tip"),

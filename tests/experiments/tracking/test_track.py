@@ -74,8 +74,8 @@ def test_a_catheter_that_moves_is_no_catheter_at_rest(tmp_path, tracker, capsys)
 
 def test_what_the_deviations_hold_is_said(tmp_path, tracker):
     folder, _ = tracked(tmp_path, pictures(tmp_path / "in", [30]), video=False)
-    assert "not what is unknown of the camera (its calibration)" in summary(folder)["tip_sd_holds"]
-    assert "not what is unknown of the camera (its calibration)" in (folder / "report.html").read_text()
+    assert "without that of the calibration of the camera" in summary(folder)["tip_sd_holds"]
+    assert "without that of the calibration of the camera" in (folder / "report.html").read_text()
 
 
 def test_the_figure_of_no_pose_says_so_and_of_one_frame_has_no_scale(tmp_path):
@@ -222,7 +222,7 @@ def test_a_rough_calibration_is_noted(tmp_path, tracker):
         evidence["deviations"] = {"fx": share * settings["fx"], "fy": share * settings["fx"]}
         path.write_text(yaml.safe_dump(settings | {"calibration": evidence}))
         folder, _ = tracked(tmp_path, source, name, video=False)
-        assert any("leaves its focal length open to 15.0 %" in note for note in summary(folder)["notes"]) == told
+        assert any("determines its focal length only to 15.0 %" in note for note in summary(folder)["notes"]) == told
 
 
 def test_a_recording_that_does_not_fit_is_refused(tmp_path, tracker, monkeypatch):

@@ -122,7 +122,7 @@ def test_an_eye_whose_errors_cannot_be_told_from_samples():
     eye = Eye(4e-3, 24e-3, 120e-3, chromatic_reference=GREEN)
     places, weights = Spectrum.led(GREEN).every(1e-9)
     assert least_followed(places, weights, 0.5, GRID, DISPLAY, eye) == len(places)
-    with pytest.raises(ValueError, match="follow every wavelength, or use a smaller pupil or a finer grid"):
+    with pytest.raises(ValueError, match="propagate every wavelength, or use a smaller pupil or a finer grid"):
         next(neighbours(random_phase(), GRID, GREEN, [GREEN], DISPLAY, eye))
 
 

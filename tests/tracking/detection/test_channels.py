@@ -52,7 +52,7 @@ def test_the_tube_beyond_the_bands_tells():
         right(TRACKER(frame[None])[0], case)
         pose = TRACKER(reordered(frame, ChannelOrder.BGR)[None])[0]
         refused(pose, Status.INCONSISTENT)
-        assert "red and blue are exchanged" in pose.reason and "ChannelOrder" in pose.reason
+        assert "exchanged red and blue channels" in pose.reason and "ChannelOrder" in pose.reason
 
 
 def test_no_single_sign_of_the_tube_refuses_a_pose():
@@ -88,7 +88,9 @@ def test_a_previous_pose_tells():
     right(TRACKER(frame[None], before)[0], case)
     pose = TRACKER(reordered(frame, ChannelOrder.BGR)[None], before)[0]
     refused(pose, Status.BANDS_MISSING)
-    assert pose.reason.startswith("the bands lie along the previous line, in the other direction: a frame whose red")
+    assert pose.reason.startswith(
+        "the bands lie along the previous line, in the other direction: exchanged red and blue"
+    )
     gone = TRACKER(WORLD.desk()[None], before)[0]  # and of a frame without them nothing of the kind is said
     assert not gone.answered and "direction" not in gone.reason
 
@@ -139,7 +141,7 @@ def test_a_mirrored_frame_is_a_possible_frame_of_any_straight_tube():
 
 def test_who_has_not_stated_the_order_is_warned_once():
     with pytest.warns(
-        ChannelOrderWarning, match=r"order BGR show .* as another pose.*channels=ChannelOrder.RGB"
+        ChannelOrderWarning, match=r"order BGR show .* in another pose.*channels=ChannelOrder.RGB"
     ) as seen:
         tracker = CatheterTracker(WORLD.camera, THESIS)
     assert len(seen) == 1 and seen[0].filename == __file__

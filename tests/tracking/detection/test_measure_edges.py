@@ -144,7 +144,7 @@ def test_what_lies_far_beyond_the_bands_leaves_the_outer_edges_alone(last):
 
 def test_bands_that_go_on_beside_the_tube_are_somebody_elses():
     thick = seen("thick", shown=replace(THESIS, radius=4e-3))
-    with pytest.raises(Refusal, match="go on beside the tube") as refusal:
+    with pytest.raises(Refusal, match="continue beside the tube") as refusal:
         thick.edges()
     assert refusal.value.status is Status.INCONSISTENT
 

@@ -153,7 +153,7 @@ def test_tip_that_moved_shows_in_chi_square():
         (frames(6), NOMINAL, [0, 1, 4], "edges 0 to 3"),
         (frames(6), NOMINAL, [0, 1, (2, 2)], "different"),
         (frames(6), NOMINAL, [()], r"pairs of different ones, got \(\)"),
-        (frames(6), NOMINAL, [0, 1, 2, 3], "nothing is left"),
+        (frames(6), NOMINAL, [0, 1, 2, 3], "none is left"),
         (frames(6)[0], NOMINAL, [0, 1, 3], r"\[F, N, 2\]"),
     ],
 )

@@ -18,7 +18,7 @@ class CellTests:
 
     ``cells``: number of pairs of eccentricity and size that were shown. ``one_way``: all of them as groups (Sec. 2.4).
     ``two_way``: eccentricity (rows) by size (columns) over the peripheral part, where every size is shown at every
-    eccentricity; None if there is no such part with two or more of both and times in every cell.
+    eccentricity; None if there is no such part with at least two of each and times in every cell.
     """
 
     cells: int

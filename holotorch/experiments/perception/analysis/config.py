@@ -125,7 +125,7 @@ class SimulationSettings(Settings):
             raise PydanticCustomError("scale", "{text}", {"text": text.format(least=least)})
         if 1 not in self.contrasts or 0 not in self.speeds_deg_s:
             raise PydanticCustomError(
-                "factors", "expected contrast 1 and speed 0 among others: alpha and beta are theirs"
+                "factors", "expected contrast 1 and speed 0 among others, to which alpha and beta apply"
             )
         return self
 

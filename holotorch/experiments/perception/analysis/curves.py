@@ -87,8 +87,7 @@ def read_responses(paths: Iterable[str]) -> Responses:
 class Times:
     """Perception times: the median of the answers of each of P participants in each condition.
 
-    ``seconds`` and ``kept`` are of the patterns with the first of the ``variants``, the highest contrast and, with it,
-    the lowest speed.
+    ``seconds`` and ``kept`` are for the first of the ``variants``: the highest contrast, and the lowest speed with it.
     """
 
     participants: NDArray[np.int64]  # numbers [P]
@@ -99,7 +98,7 @@ class Times:
     counts: dict[str, int]  # number of all trials and of those that each criterion excluded, by name
     simulated: bool = False  # whether the answers are simulated
     variants: tuple[tuple[float, float], ...] = (AS_IN_THESIS,)  # the W pairs of contrast and speed in deg/s
-    of_variants: Array | None = None  # medians of all of them [P, E, S, W]; None: W is 1
+    of_variants: Array | None = None  # medians of all variants [P, E, S, W]; None: W is 1
 
     @property
     def all_seconds(self) -> Array:
@@ -181,7 +180,7 @@ def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
 
 
 def _variants(responses: Responses) -> tuple[tuple[tuple[float, float], ...], NDArray[np.int64]]:
-    """The pairs of contrast and speed, the highest contrast and then the lowest speed first, and that of each trial."""
+    """Pairs of contrast (falling) and speed (rising), and the index of the pair of each trial."""
     trials = len(responses.target)
     contrast = np.full(trials, AS_IN_THESIS[0]) if responses.contrast is None else responses.contrast
     speed = np.full(trials, AS_IN_THESIS[1]) if responses.speed_deg_s is None else responses.speed_deg_s

@@ -37,7 +37,7 @@ class Effect:
 
 
 def level_effects(times: Times, confidence: float) -> list[Effect]:
-    """For each other contrast and speed, the time that it adds to the reference, without a model.
+    """Time that each contrast and speed adds to the time of the reference, without a model.
 
     A participant's value is the mean difference over all pairs of eccentricity and size with a time in both.
     """
@@ -87,7 +87,7 @@ def model_effects(times: Times, middle_deg: float, confidence: float) -> list[Ef
 def _fit(seconds: Array, terms: Array) -> Array:
     """Coefficients [K] of terms [E, S, W, K] in the times [E, S, W] of one participant; NaN if they are not determined.
 
-    The mean of every pair of eccentricity and size is subtracted, which fits its own T(E, S).
+    The mean of every pair of eccentricity and size is subtracted, which eliminates T(E, S).
     """
     measured = np.isfinite(seconds)
     number = np.maximum(measured.sum(-1, keepdims=True), 1)

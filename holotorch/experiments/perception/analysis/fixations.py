@@ -1,4 +1,4 @@
-"""Which trials of a log count, where an eye tracker checked the fixation."""
+"""Whether fixation was held in the trials of a log, if an eye tracker checked it."""
 
 from typing import Any
 

@@ -121,7 +121,7 @@ def _with_factors(
     """Times [P, N W], (eccentricity, size) [N W, 2] and (contrast, speed) [N W, 2] of N conditions in W variants.
 
     ``times`` [P, N] are those of black patterns at rest at the conditions ``where`` [N, 2]. No random number is drawn
-    if there are no others.
+    if there are no other variants.
     """
     variants = np.array(list(product(settings.contrasts, settings.speeds_deg_s)))
     conditions = len(where)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 Pattern = Literal["cross", "circle"]
 Side = Literal["left", "right"]
-_Appearance = tuple[float, float, Side, Pattern, bool, float, float]  # as the fields of Trial, without its wait
+_Appearance = tuple[float, float, Side, Pattern, bool, float, float]  # from eccentricity_deg on, except wait_s
 _OTHER: dict[Pattern, Pattern] = {"cross": "circle", "circle": "cross"}
 _SIDES: dict[str, tuple[Side, ...]] = {"left": ("left",), "right": ("right",), "both": ("left", "right")}
 ORDERS = ("thesis", "williams")

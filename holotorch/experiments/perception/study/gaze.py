@@ -41,9 +41,9 @@ class GazeSettings(Settings):
     ``source``: "tracker" sends samples while the study runs; "file": samples are in a CSV file beside the log later;
     "mouse": the mouse stands in for an eye tracker, to try the study out; the analysis refuses its results.
     ``radius_deg``: greatest angle between gaze and fixation point. ``share``: share of the samples that must be within
-    it, in the ``before_s`` seconds before a pattern and, separately, from its onset to the answer or its end. Samples
-    without an eye are not within it. ``gap_s``: longest time without a sample. ``attempts``: how often a trial whose
-    fixation is broken is shown in all; the repeats come at the end of its round.
+    it, in the ``before_s`` seconds before a pattern and, separately, from its onset to the answer or its end. Invalid
+    samples count as outside it. ``gap_s``: longest time without a sample. ``attempts``: how often a trial is
+    shown at most if its fixation is broken; the repeats come at the end of its round.
 
     The thesis gives none of these numbers. The defaults are assumptions: 3 deg exceeds the errors of a remote tracker,
     about 1 deg, and is well below the 10 deg of the innermost peripheral pattern.
@@ -195,7 +195,7 @@ class GazeFile:
 
 
 def read_gaze(path: Path, settings: GazeSettings) -> GazeTrack:
-    """Read a CSV file of samples; lines that are none are dropped and counted, as those that come live.
+    """Read a CSV file of samples; lines that are not samples are dropped and counted, as in a live stream.
 
     Raises:
         ConfigError: The file cannot be read, or its first line is not ``time,x_deg,y_deg,valid``.

@@ -1,8 +1,8 @@
 """Log of a study: one line of JSON per trial, which is saved before the next trial begins.
 
 The first line is a header, ``{"format": "holotorch-trials", "version": 1, ...}``; each other line is a trial. Lines are
-only ever appended, and each is followed by fsync, so that a crash loses at most the trial on the screen. A line during
-which the recording crashed has no line end: readers ignore it and set ``torn``, and ``TrialLog`` removes it.
+only ever appended, and each is followed by fsync, so that a crash loses at most the trial on the screen. A line
+that a crash cut off has no line end: readers ignore it and set ``torn``, and ``TrialLog`` removes it.
 """
 
 import contextlib

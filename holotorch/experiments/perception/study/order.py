@@ -1,4 +1,4 @@
-"""The order in which trials are shown: that of the design, and repeats of those whose fixation was broken."""
+"""The order in which trials are shown: the trials of the design, and repeats of trials with broken fixation."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -14,20 +14,20 @@ class Appearance:
     attempt: int = 1
 
     def to_json(self) -> dict[str, Any]:
-        """What the page needs to show it."""
+        """Data of the trial for the page."""
         return asdict(self.trial) | {"goal": self.trial.goal, "attempt": self.attempt}
 
 
 class Order:
-    """The appearances of one participant, in order. Each result may add one at the end of its round.
+    """The trials shown to one participant, in order. A broken fixation adds a repeat at the end of the round.
 
-    Practice trials are not repeated. ``attempts`` is how often a trial is shown at most.
+    Practice trials are not repeated. ``attempts`` is the largest number of times that a trial is shown.
     """
 
     def __init__(self, design: Design, attempts: int = 1):
         self.appearances = [Appearance(trial) for trial in design.trials]
         self._attempts = attempts
-        self._repeats: dict[int, int] = {}  # index of a broken appearance, and that of its repeat
+        self._repeats: dict[int, int] = {}  # index of the repeat by that of the broken appearance
 
     def record(self, index: int, fixated: bool | None) -> None:
         """Note the result of appearance ``index``, once for each and in order; False adds a repeat."""

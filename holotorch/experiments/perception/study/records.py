@@ -77,7 +77,7 @@ class SessionRequest(Record):
 
 
 class FixationRequest(SessionRequest):
-    """Request of the page, answered when fixation differs from ``fixated``, or after a second."""
+    """Request of the page, answered when the state of the fixation is no longer ``fixated``, or after a second."""
 
     fixated: Flag
 

@@ -36,7 +36,7 @@ _LARGEST = 10_000  # largest body of a request in bytes; a result has about 200
 _CONNECTIONS = 64  # largest number of simultaneous connections; a browser opens six
 _SECONDS = 10.0  # longest duration of a connection; an answer takes milliseconds, one about the fixation a second
 _LATEST_S = 0.3  # how long the check of a trial waits for gaze samples that are still on their way
-_STEP_S = 0.01  # how often a waiting request looks again
+_STEP_S = 0.01  # interval between the checks of a waiting request
 _HEADERS = headers("")
 # aiohttp would log every malformed request with a traceback; StudyServer prints the errors of its own code.
 _QUIET = logging.getLogger(f"{__name__}.requests")
@@ -152,7 +152,7 @@ class StudyServer:
         return web.json_response(answer, status=status)
 
     async def _fixation(self, value: Any) -> bool:
-        """Whether the fixation point is looked at, as soon as this differs from what the page knows."""
+        """Whether the participant looks at the fixation point; waits up to 1 s for this to change."""
         try:
             known = parse_record(FixationRequest, value).fixated
         except ValueError as error:
@@ -166,7 +166,7 @@ class StudyServer:
         return fixated
 
     async def _samples_until(self, moment: float | None) -> None:
-        """Wait until gaze samples of this Unix time have come, but not for long."""
+        """Wait until gaze samples of this Unix time have come, at most ``_LATEST_S``."""
         end = time.monotonic() + _LATEST_S
         while moment is not None and self.session.gaze and self.session.gaze.last < moment and time.monotonic() < end:
             await asyncio.sleep(_STEP_S)

@@ -51,7 +51,7 @@ class StudySession:
         }
 
     def look(self, samples: Any) -> dict[str, Any]:
-        """Take gaze samples sent by the eye tracker; the answer says how many of them and of all were used."""
+        """Add gaze samples sent by the eye tracker; returns how many were used, of these and in all."""
         assert self.gaze is not None  # checked by the server
         added = self.gaze.add(samples, time.time())
         if self._gaze_file:

@@ -1,4 +1,4 @@
-"""The view of an observer: where the eye focuses, how wide its pupil is, and what light it sees the hologram by."""
+"""The view of an observer: focus and pupil of the eye, light source, and orientation of the volume."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ from holotorch.metrics import speckle_contrast, ssim
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 from holotorch.optics.viewing.imaging import CollapseSampling
 
-_TOLERANCE = 0.5  # of the way to the retina: the fast method wherever it is of use, and its error is shown
+_TOLERANCE = 0.5  # of the propagation to the retina, so large that the fast method is used; its error is shown
 _ONE = "one"  # one wavelength for each colour
 _RENDERING = "Direct volume rendering"
 _NAMES = {"laser": "laser, 1.4 nm", "narrow_sled": "narrow SLED, 5 nm", "sled": "SLED, 10 nm", "led": "LED, 20 nm"}

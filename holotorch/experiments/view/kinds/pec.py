@@ -25,14 +25,14 @@ class PECViewer(Viewer):
 
     def __init__(self, folder: Path, experiment: PECExperiment):
         self.title = "Corrected picture of a phased array"
-        # An array of its own, whose heat changes with a control and is shared by the experiments at all distances.
+        # A separate array, whose heat changes with a control and is shared by the experiments at all distances.
         self._array = PhasedArray(
             experiment.wavelengths,
             experiment.array.crosstalk,
             reference_response=experiment.array.reference_response,
         )
         self._experiment, self._assumed = replace(experiment, array=self._array), experiment.array.crosstalk
-        # Of a measured kernel, the Gaussian that fits it best stands for it on the slider.
+        # On the slider, the Gaussian that fits it best represents a measured kernel.
         given, kernel = experiment.settings.modulator.sigma_px, experiment.array.crosstalk.kernel
         self._sigma = ThermalCrosstalk.fitted(kernel).sigma_px if given is None else given
         self._heaters = pec_heaters(folder, experiment)[:, experiment.lit].to(experiment.device)
