@@ -24,7 +24,7 @@ OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one subcommand and return its exit status: 0 success, 1 failure, 2 bad input, 130 interruption."""
-    options = _parser().parse_args(arguments)
+    options = _parsed(arguments)
     from holotorch.experiments.config.errors import ConfigError
 
     try:
@@ -191,6 +191,17 @@ def _export_heaters(options: argparse.Namespace) -> int:
 
 
 _INTERRUPTIBLE = (_run, _resume, _demo, _chart, _export_slm, _export_heaters)
+
+
+def _parsed(arguments: list[str] | None) -> argparse.Namespace:
+    """The arguments, with ``key=value`` also after options, where argparse takes no more positional arguments."""
+    parser = _parser()
+    options, left = parser.parse_known_args(arguments)
+    if left and not (hasattr(options, "overrides") and all(re.match(r"[\w.]+=", word) for word in left)):
+        parser.error(f"unrecognized arguments: {' '.join(left)}")
+    if left:
+        options.overrides = [*options.overrides, *left]
+    return options
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -17,10 +17,11 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     track = commands.add_parser("track", help="a catheter's tip on every frame of a video, a folder or a camera")
     what = "video, folder of pictures or of a recording, number of a camera, or: synthetic"
     track.add_argument("source", metavar="SOURCE", help=what)
+    track.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, such as frames=10")
     track.add_argument("--out", type=Path, help="folder of the run (default: runs/track-001, ...)")
     track.add_argument("--method", default="ours", help="ours (default) or thesis")
     track.add_argument("--record", action="store_true", help="keep every frame, losslessly, to be tracked again")
-    track.add_argument("--no-video", action="store_true", help="write no overlay video")
+    track.add_argument("--no-video", action="store_true", help="write no videos")
     track.add_argument("--still", action="store_true", help="the catheter is at rest: measure its stability")
     track.add_argument("--rate", type=float, metavar="HZ", help="frames per second of a source without times")
     track.set_defaults(action=_track)
@@ -45,8 +46,9 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _track(options: argparse.Namespace) -> int:
+    from holotorch.experiments.config.errors import ConfigError
     from holotorch.experiments.config.messages import validated
-    from holotorch.experiments.config.source import Key, Source
+    from holotorch.experiments.config.source import Key, Source, override
     from holotorch.experiments.execute import execute
     from holotorch.experiments.tracking.config import TrackSettings
 
@@ -54,7 +56,12 @@ def _track(options: argparse.Namespace) -> int:
     given |= {"video": not options.no_video, "rate_hz": options.rate}
     given |= {name: str(path) for name in ("camera", "catheter", "headset") if (path := getattr(options, name))}
     arguments: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
-    settings = validated(Source(Path("track"), {"experiment": "track", **given}, arguments), TrackSettings)
+    source, mistakes = Source(Path("track"), {"experiment": "track", **given}, arguments), list[str]()
+    for word in options.overrides:
+        override(source, word, mistakes)
+    if mistakes:
+        raise ConfigError(mistakes)
+    settings = validated(source, TrackSettings)
     folder, complete = execute(settings, options.out, "track")
     page = folder / "report.html"
     print(page if page.is_file() else folder)

@@ -166,7 +166,8 @@ def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
         return _tracked(experiment, experiment.inputs, folder)
     settings = experiment.settings
     camera, catheter = _files(settings)
-    recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, camera=camera, catheter=catheter)
+    made = {"camera": camera, "catheter": catheter, "video": settings.video}
+    recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, **made)
     inputs = _open(settings, recording)
     return _tracked(replace(experiment, inputs=inputs, truth=read_truth(recording)), inputs, folder)
 
