@@ -262,14 +262,14 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec, joint or volume")
     panel = "a panel, such as configs/slm/lcos_2048.yaml, and its settings to change"
     export.add_argument("--slm", nargs="+", required=True, metavar=("FILE", "key=value"), help=panel)
-    export.add_argument("--out", type=Path, help="folder for the files (default: DIR/slm)")
+    export.add_argument("--out", type=Path, help="folder for the files (default: DIR/slm, DIR/slm-002, ...)")
     export.add_argument("--encoding", help="of a volume: double_phase (default), kinoform, error_diffusion")
     export.add_argument("--format", default="png", help="png (default), bmp, or exr for phases instead of levels")
 
     about = "heater phases, temperatures and optical phases of a run, as NumPy, CSV and PNG files"
     heaters = command("export-heaters", _export_heaters, about)
     heaters.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec or joint")
-    heaters.add_argument("--out", type=Path, help="folder for the files (default: DIR/heaters)")
+    heaters.add_argument("--out", type=Path, help="folder for the files (default: DIR/heaters, DIR/heaters-002, ...)")
     heaters.add_argument("--bits", type=int, default=16, help="resolution of the heaters' drive levels (default: 16)")
 
     add_tracking(commands)
