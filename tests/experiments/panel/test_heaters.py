@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from tiny_runs import RUNS
 
 from holotorch.cli import main
 from holotorch.experiments.execute import execute
-from holotorch.experiments.panel.heaters import export_heaters
+from holotorch.experiments.panel.heaters import export_heaters, heaters_text
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.view.opening import open_viewer
 from holotorch.io.panel_files import read_levels
@@ -115,7 +116,13 @@ def test_heater_files_say_what_they_are_and_agree(tmp_path, capsys):
         np.testing.assert_allclose(levels.numpy() * about["step"], array, atol=0.51 * about["step"] + 1e-5)
         assert (about["unit"], about["quantity"]) == (entry["unit"], entry["quantity"])
         assert entry["quantity"] != "heater" or levels.int().max() <= 255
-    assert main(["export-heaters", str(run)]) == 2 and "holds files already" in capsys.readouterr().err
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    for number in ("002", "003"):  # as folders of runs number themselves
+        assert main(["export-heaters", str(run), "--bits", "8"]) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == f"{out}-{number}"
+        assert {path.name: path.read_bytes() for path in Path(f"{out}-{number}").iterdir()} == before
+    assert main(["export-heaters", str(run), "--out", str(out)]) == 2
+    assert "holds files already" in capsys.readouterr().err
     assert main(["export-heaters", str(tmp_path)]) == 2 and "holds no run" in capsys.readouterr().err
 
 
@@ -177,6 +184,22 @@ def test_coarse_levels_above_the_limit_are_warned_of_and_files_of_near_colours_s
             peaks.append(torch.nn.functional.conv2d(driven, taps, padding=2).max().item())
     assert report["peak_phase_of_levels_rad"] == pytest.approx(max(peaks), rel=1e-9)
     assert max(peaks) > report["limit_rad"] == pytest.approx(300 * 0.03 * 630 / 532.4)
+
+
+def test_levels_above_the_limit_by_a_hair_are_warned_of_and_16_bits_are_not(tmp_path):
+    chip = "{sigma_px: 0.66, kernel_size: 5, max_phase: 6.3}"
+    run = tmp_path / "run"
+    assert main(["run", *SMALL, f"modulator={chip}", "--out", str(run)]) == 0
+    phase = torch.from_numpy(np.load(run / "arrays" / "phase.npy")).double()
+    taps = torch.from_numpy(kernel(scale=1.0)).expand(phase.shape[1], 1, 5, 5)
+    phase *= 6.3 / torch.nn.functional.conv2d(phase, taps, padding=2, groups=phase.shape[1]).max()  # at the limit
+    np.save(run / "arrays" / "phase.npy", phase.float().numpy())
+    excess = {}
+    for bits in range(6, 17):
+        _, report = export_heaters(run, bits=bits)
+        excess[bits] = report["peak_phase_of_levels_rad"] / report["limit_rad"] - 1
+        assert ("WARNING" in heaters_text(report)) == (excess[bits] > 5e-5)
+    assert excess[16] < 5e-5 and any(5e-5 < each < 1e-3 for each in excess.values())
 
 
 def test_an_export_that_fails_leaves_no_files(tmp_path, capsys, monkeypatch):
