@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field
 from holotorch.core.quantities import SIGMA_PX
 from holotorch.experiments.config.settings import (
     Count,
+    ExistingPath,
     GridSettings,
     Number,
     Phase,
@@ -32,7 +33,8 @@ class DisplaySettings(GridSettings):
     ``distance``: of the volume's middle. ``depth``: the volume is stretched along the axis to this extent, since one as
     deep as it is wide would be sharp at every focus; not stretched by default. ``planes``: number of planes that hold
     its light; by default 5, or as many as the tolerance of the run needs (up to 64, with slabs one per frame).
-    ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
+    ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``kernel``: in its place, whatever ``sigma_px``
+    says, a measured one, a NumPy or CSV file as in runs of kind pec. ``max_phase``: upper limit in rad on
     the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm). ``max_temperature``: in its place a
     limit on the temperature of every pixel above ambient, such as 500 degC, which all colours
     share in phase. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
@@ -42,6 +44,7 @@ class DisplaySettings(GridSettings):
     depth: Depth | None = None
     planes: Annotated[Count, Field(le=64)] | None = None
     sigma_px: Annotated[Number, plausible(SIGMA_PX)] = 0.66
+    kernel: ExistingPath | None = None
     max_phase: Phase = 4 * math.pi
     max_temperature: TemperatureRise | None = None
     rad_per_K: Annotated[Number, Field(ge=1e-5, le=10)] = math.pi / 175
@@ -94,8 +97,7 @@ class JointSettings(Settings):
     """
 
     elsewhere: ClassVar[dict[str, str]] = {
-        "modulator": "display describes the chip, by sigma_px, max_phase or max_temperature, and rad_per_K; a measured "
-        "kernel is of kind pec only, whose check tells the sigma_px that fits it best",
+        "modulator": "display describes the chip, by sigma_px or kernel, max_phase or max_temperature, and rad_per_K",
         "hologram": "display has shape, pitch, distance and planes",
     }
 

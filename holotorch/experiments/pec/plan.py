@@ -150,7 +150,7 @@ def _crosstalk_line(values: dict[str, Any]) -> str:
                 f"{values['fit_residual']:.2g} of it (rms)"
             )
             if values["fit_residual"] > _NO_GAUSSIAN:
-                line += ": no Gaussian stands for this kernel where only a sigma can be given"
+                line += ": no Gaussian stands for this kernel"
         return line
     return (
         f"Crosstalk  heat spreads with sigma {values['sigma_px']:g} px over {values['taps']} taps "

@@ -4,12 +4,15 @@ All errors are relative L2 errors of the intensity that the heater phases form, 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.io.heat_kernels import load_heat_kernel
 from holotorch.modulator import ThermalCrosstalk
 
 HEAT, PROPAGATION, STOPPING = "heat", "propagation", "stopping"  # parts that share the tolerance of a run
@@ -28,6 +31,21 @@ class HeaterPhases:
     mean: float
     deviation: float
     shape: tuple[int, int]
+
+
+def measured_crosstalk(path: str, shape: Sequence[int], key: str) -> ThermalCrosstalk:
+    """The spreading of the heat by a measured kernel from a file, on an array of ``shape`` pixels (y, x).
+
+    ConfigError, with the ``key`` of the configuration that names the file, for one that cannot be used.
+    """
+    try:
+        crosstalk = ThermalCrosstalk.from_patch(load_heat_kernel(path))
+    except ValueError as error:
+        raise ConfigError([f"{key}: {error}"]) from error
+    if any(taps > side for taps, side in zip(crosstalk.kernel.shape, shape, strict=True)):
+        size = f"{crosstalk.kernel.shape[0]} x {crosstalk.kernel.shape[1]}"
+        raise ConfigError([f"{key}: {size} taps are more than the {tuple(shape)} px of the array"])
+    return crosstalk
 
 
 def complete_kernel(sigma_px: float) -> ThermalCrosstalk:
