@@ -19,8 +19,9 @@ from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import Recorder, is_recording
 from holotorch.io.video import Frame, replacing_video
+from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.evaluation.protocols import coverage
-from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.catheter import THESIS, Catheter
 from holotorch.tracking.simulation.scenery import SKIN, drape, finger
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
@@ -57,12 +58,7 @@ def write_synthetic(
     Raises:
         ConfigError: A file cannot be used, the folder is in use, or the catheter would not be in front of the camera.
     """
-    settings = None if camera is None else devices.load_camera(find_config(camera) or camera)
-    tool = THESIS
-    if catheter is not None:
-        tool = devices.build_catheter(devices.load_catheter(find_config(catheter) or catheter))
-    size = (settings and settings.size) or size
-    model = synthetic_camera(size) if settings is None else devices.build_camera(settings)
+    size, model, tool = synthetic_rig(camera, catheter, size)
     folder = claim(out, "synthetic")
     try:
         _render(folder, frames, World(size=size, camera=model, catheter=tool), video)
@@ -74,9 +70,16 @@ def write_synthetic(
     return folder
 
 
-def frame_size(camera: Path | None) -> tuple[int, int]:
-    """(H, W) of the frames that :func:`write_synthetic` renders for a camera. ConfigError for an invalid file."""
-    return (None if camera is None else devices.load_camera(find_config(camera) or camera).size) or _SIZE
+def synthetic_rig(
+    camera: Path | None, catheter: Path | None, size: tuple[int, int] = _SIZE
+) -> tuple[tuple[int, int], Camera, Catheter]:
+    """(H, W) of the frames, camera and catheter that :func:`write_synthetic` renders. ConfigError for invalid files."""
+    settings = None if camera is None else devices.load_camera(find_config(camera) or camera)
+    tool = THESIS
+    if catheter is not None:
+        tool = devices.build_catheter(devices.load_catheter(find_config(catheter) or catheter))
+    size = (settings and settings.size) or size
+    return size, synthetic_camera(size) if settings is None else devices.build_camera(settings), tool
 
 
 def _render(folder: Path, frames: int, world: World, video: bool) -> None:
