@@ -88,7 +88,8 @@ class JointReport(Settings):
 class JointSettings(Settings):
     """A volume shown by ``frames`` heater patterns in turn, optimised together for what an eye sees at every focus.
 
-    One wavelength shows the mean of the volume's colours, three show red, green and blue. ``steps``: of L-BFGS.
+    One wavelength shows the mean of the volume's colours, three show red, green and blue, others share these as in runs
+    of kind volume. ``steps``: of L-BFGS.
     ``light_weight``: weight of the light that misses the pupil or the window, against the error of the images.
     ``heat``: heat that is left from earlier frames is part of the model; by default each frame starts cold.
     ``tolerance``: allowed relative L2 error of the images, divided between the taps of the heat kernel, the planes
@@ -134,8 +135,8 @@ def volume_settings(settings: JointSettings, planes: int | None = None) -> dict[
     display = settings.display
     hologram = {"shape": display.shape, "pitch": display.pitch, "distance": display.distance}
     hologram["depths"] = (display.planes or PLANES) if planes is None else planes
-    # The renderer knows three colours; one wavelength shows their mean.
-    wavelengths = settings.wavelengths if len(settings.wavelengths) == 3 else settings.wavelengths[:1] * 3
+    # A single wavelength shows the mean of three rendered colours.
+    wavelengths = settings.wavelengths if len(settings.wavelengths) > 1 else settings.wavelengths * 3
     same = {name: getattr(settings, name) for name in ("seed", "device", "volume", "transfer", "view")}
     return {"experiment": "volume", "hologram": hologram, "wavelengths": wavelengths, **same}
 
@@ -145,8 +146,8 @@ def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
     from holotorch.experiments.volume import config as volume
 
     problems: list[tuple[Key, str]] = []
-    if (count := len(settings.wavelengths)) not in (1, 3):
-        return [(("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {count}")]
+    if not settings.wavelengths:
+        return [(("wavelengths",), "expected 1 (grey), 3 (red, green, blue) or another number, got 0")]
     display = settings.display
     renamed: dict[Key, Key] = {("hologram", "distance"): ("display", "distance")}
     scene = volume.VolumeSettings.model_validate(volume_settings(settings))

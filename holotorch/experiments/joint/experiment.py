@@ -108,8 +108,8 @@ class JointExperiment:
         """Colours and opacities of the planes, at their stretched depths."""
         with torch.no_grad():
             layers = self.scene.sampler().slab_layers(self.scene.volume)
-        grey = len(self.settings.wavelengths) == 1
-        emission = layers.emission.mean(1, keepdim=True) if grey else layers.emission
+        count = len(self.settings.wavelengths)
+        emission = layers.emission.mean(1, keepdim=True) if count == 1 else layers.emission[:, :count]
         return replace(layers, depths=self.depths, emission=emission)
 
     @cached_property
