@@ -57,6 +57,12 @@ def test_a_kernel_that_is_no_gaussian_is_said(tmp_path, capsys):
         ("kernel.csv", "1,2\n3", "expected a table of temperature rises, a line for each row of pixels"),
         ("kernel.csv", "0,1,0\n1,2,9\n0,1,0", "heated centre the warmest"),
         ("kernel.csv", "0,1\n1,2", "two odd sizes"),
+        (
+            "kernel.csv",
+            "0,0,0,0\n0,1,0,0\n1,9,2,0\n0,1,0,0",
+            "; the warmest pixel is in row 3, column 2 of the file: keep rows 2 to 4 and columns 1 to 3",
+        ),
+        ("kernel.png", "no numbers", "levels of a picture are no temperatures, write the rises as numbers"),
         ("kernel.csv", "0,1,0\n1,nan,1\n0,1,0", "nan"),
         ("kernel.npy", "no array", "expected a table"),
         ("kernel.mat", "0", "expected a heat kernel as .npy, .csv or .txt"),
