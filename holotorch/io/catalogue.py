@@ -85,9 +85,9 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     file = folder / entry.url.rsplit("/", 1)[1]
     cause = None
     if file.is_file() or file not in _failed:
-        load = pooch.HTTPDownloader(timeout=_TIMEOUT)
+        known, load = f"sha512:{entry.sha512}", pooch.HTTPDownloader(timeout=_TIMEOUT)
         try:
-            pooch.retrieve(entry.url, f"sha512:{entry.sha512}", fname=file.name, path=folder, downloader=load)
+            pooch.retrieve(entry.url, known, file.name, folder, downloader=load)  # type: ignore[arg-type]
             _failed.pop(file, None)
         except OSError as error:  # includes the errors of the requests library
             cause, _failed[file] = error, _reason(error)

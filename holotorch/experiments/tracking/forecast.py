@@ -1,5 +1,6 @@
 """How far away a catheter can be found by a camera, before a frame is taken."""
 
+import math
 from itertools import pairwise
 
 import torch
@@ -42,7 +43,7 @@ def working_range(camera: Camera, catheter: Catheter) -> tuple[float, str]:
 def _certain(camera: Camera, catheter: Catheter, most: float) -> float:
     """Largest distance in metres up to which edges determine the tip to ``most`` metres."""
     positions, matrix = catheter.positions, camera.matrix.detach().double()
-    z = torch.logspace(*torch.tensor([_NEAREST, _FARTHEST]).log10().tolist(), _STEPS, dtype=torch.float64)
+    z = torch.logspace(math.log10(_NEAREST), math.log10(_FARTHEST), _STEPS, dtype=torch.float64)
     along = positions - (positions[0] + positions[-1]) / 2
     x = matrix[0, 0] * along / z[:, None] + matrix[0, 2]
     pinhole = Camera(matrix, torch.zeros(5, dtype=torch.float64))

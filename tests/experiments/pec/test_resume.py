@@ -280,12 +280,11 @@ def test_the_progress_bar_names_the_stage_and_its_loss_never_jumps_up(words, sta
     class Watched(Log):
         def __call__(self, solution):
             super().__call__(solution)
-            shown.append(dict(part.split("=") for part in self.bar.postfix.split(", ")))
+            shown.append(dict(part.split("=") for part in str(self.bar.postfix).split(", ")))
 
     monkeypatch.setattr(run_module, "Log", Watched)
     assert execute(settings(*words), tmp_path / "run")[1]
     names = [f"{k}/{len(stages)}" for k, steps in enumerate(stages, 1) for _ in range(steps)]
     assert [each["stage"] for each in shown] == names
-    for before, after in zip([None, *shown], shown, strict=False):
-        start = before is None or before["stage"] != after["stage"]
-        assert float(after["loss"]) <= (1.0 if start else float(before["loss"]))
+    for before, after in zip([{"stage": "", "loss": ""}, *shown], shown, strict=False):
+        assert float(after["loss"]) <= (float(before["loss"]) if before["stage"] == after["stage"] else 1.0)

@@ -14,9 +14,8 @@ ICONS = ("wheel", "coaster", "castle", "boat", "tent", "carousel", "food", "firs
 
 def _no_icon(name: str) -> str:
     hint = nearest(name, list(ICONS))
-    return f"expected one of {', '.join(ICONS)}, or a picture file (PNG, JPEG) that exists, got {short(name)}" + (
-        hint if "did you mean" in hint else ""
-    )
+    wanted = f"expected {', '.join(map(repr, ICONS))}, or a picture file (PNG, JPEG) that exists"
+    return f"{wanted}, got {short(name)}{hint if 'did you mean' in hint else ''}"
 
 
 Icon = Annotated[str, existing(lambda name: name in ICONS or Path(name).is_file(), _no_icon)]
