@@ -19,8 +19,8 @@ def range_text(camera: Camera, catheter: Catheter) -> str:
     distance, reason = working_range(camera, catheter)
     focal, shortest = _focal(camera), _shortest(catheter)
     return (
-        f"Range      tips are found up to about {distance:.2g} m from the camera (bands in full view, good light, full "
-        f"colours): there the shortest band, {1e3 * shortest:.3g} mm, is {focal * shortest / distance:.0f} px long and "
+        f"Range      the bands may be up to about {distance:.2g} m from the camera (in full view, good light and full "
+        f"colours): there the shortest one, {1e3 * shortest:.3g} mm, is {focal * shortest / distance:.0f} px long and "
         f"the tube {2 * focal * catheter.radius / distance:.1f} px wide; beyond, {reason}"
     )
 
@@ -49,8 +49,8 @@ def _certain(camera: Camera, catheter: Catheter, most: float) -> float:
     pinhole = Camera(matrix, torch.zeros(5, dtype=torch.float64))
     edges = torch.stack([x, matrix[1, 2].expand_as(x)], -1)
     pose = solve_pose(edges, positions, pinhole, along_px=_EDGE, across_px=_EDGE)
-    vague = ~(pose.tip_sd <= most)
-    return float(z[int(vague.to(torch.uint8).argmax())]) if bool(vague.any()) else _FARTHEST
+    certain = pose.tip_sd <= most
+    return float(z[certain].max()) if bool(certain.any()) else _NEAREST
 
 
 def _focal(camera: Camera) -> float:

@@ -79,7 +79,10 @@ def test_a_box_counts_its_median_and_keeps_the_geometry_of_a_file(capsys):
             "--bands: expected 3 places, one for each band from the tip on, got 2",
         ),
         (["bands.png", "--bands", "1,1", "red", "2,2"], "expected X,Y or X0,Y0,X1,Y1 in pixels, got 'red'"),
-        (["bands.png", "--bands", "1,1", "40,1", "2,2"], "expected places on the picture of 40 x 30 px, got '40,1'"),
+        (
+            ["bands.png", "--bands", "1,1", "40,1", "2,2"],
+            "expected places on the picture of 40 x 30 px, X0,Y0 before X1,Y1, got '40,1'",
+        ),
         (["bands.png", "--bands", "5,5", "9,9", "9,5"], "saturated colours"),
         (["none.png", "--bands", "5,5", "9,9", "9,5"], "none.png: no such picture"),
         (["none.mp4", "--bands", "5,5", "9,9", "9,5"], "none.mp4"),
@@ -151,5 +154,5 @@ def test_more_pixels_see_farther():
     tool = World().catheter
     near, far = (working_range(synthetic_camera(size), tool)[0] for size in ((540, 960), (1080, 1920)))
     assert far == pytest.approx(2 * near, rel=1e-9)
-    assert range_text(synthetic_camera(), tool).startswith("Range      tips are found up to about 1.2 m")
+    assert range_text(synthetic_camera(), tool).startswith("Range      the bands may be up to about 1.2 m")
     assert torch.isfinite(torch.tensor(far))
