@@ -24,7 +24,7 @@ OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one subcommand and return its exit status: 0 success, 1 failure, 2 bad input, 130 interruption."""
-    options = _parser().parse_args(arguments)
+    options = _parsed(arguments)
     from holotorch.experiments.config.errors import ConfigError
 
     try:
@@ -193,6 +193,17 @@ def _export_heaters(options: argparse.Namespace) -> int:
 _INTERRUPTIBLE = (_run, _resume, _demo, _chart, _export_slm, _export_heaters)
 
 
+def _parsed(arguments: list[str] | None) -> argparse.Namespace:
+    """The arguments, with ``key=value`` also after options, where argparse takes no more positional arguments."""
+    parser = _parser()
+    options, left = parser.parse_known_args(arguments)
+    if left and not (hasattr(options, "overrides") and all(re.match(r"[\w.]+=", word) for word in left)):
+        parser.error(f"unrecognized arguments: {' '.join(left)}")
+    if left:
+        options.overrides = [*options.overrides, *left]
+    return options
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="holotorch", description="Differentiable optics for VR and AR displays.")
     parser.add_argument("--version", action="version", version=f"holotorch {__version__}")
@@ -251,14 +262,14 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec, joint or volume")
     panel = "a panel, such as configs/slm/lcos_2048.yaml, and its settings to change"
     export.add_argument("--slm", nargs="+", required=True, metavar=("FILE", "key=value"), help=panel)
-    export.add_argument("--out", type=Path, help="folder for the files (default: DIR/slm)")
+    export.add_argument("--out", type=Path, help="folder for the files (default: DIR/slm, DIR/slm-002, ...)")
     export.add_argument("--encoding", help="of a volume: double_phase (default), kinoform, error_diffusion")
     export.add_argument("--format", default="png", help="png (default), bmp, or exr for phases instead of levels")
 
     about = "heater phases, temperatures and optical phases of a run, as NumPy, CSV and PNG files"
     heaters = command("export-heaters", _export_heaters, about)
     heaters.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec or joint")
-    heaters.add_argument("--out", type=Path, help="folder for the files (default: DIR/heaters)")
+    heaters.add_argument("--out", type=Path, help="folder for the files (default: DIR/heaters, DIR/heaters-002, ...)")
     heaters.add_argument("--bits", type=int, default=16, help="resolution of the heaters' drive levels (default: 16)")
 
     add_tracking(commands)

@@ -176,7 +176,12 @@ class PECProblem(nn.Module):
         """U, real [..., C, *image], of phases after spreading."""
         if self.frames and spread.ndim < 4:
             raise ValueError(f"phase must end in (F, C, H, W), as frames=True has it, got {tuple(spread.shape)}")
-        image = self.propagator(phasor(spread))
+        try:
+            image = self.propagator(phasor(spread))
+        except ValueError as error:  # of a field of another shape, which is that of the phase that was given
+            if not (message := str(error)).startswith("field must end in"):
+                raise
+            raise ValueError(message.replace("field", "phase", 1)) from None
         image = intensity(image) if image.is_complex() else image
         if not self.frames:
             return image

@@ -9,6 +9,8 @@ from holotorch.io.files import cache_folder
 from holotorch.io.volumes import load_volume
 from holotorch.scene.volume import Volume
 
+_TIMEOUT = 10  # seconds to wait for a server that does not answer
+_failed: dict[Path, str] = {}  # reasons of failed downloads by file; a process asks the server for each once
 _ORIGIN = "http://klacansky.com/open-scivis-datasets"
 
 
@@ -57,6 +59,8 @@ PUBLISHED = {
 def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     """Download a volume of the thesis, verify its checksum and load it; later calls use the downloaded file.
 
+    A download that failed is not tried again by the same process, since without a network every trial takes its time.
+
     Args:
         name: A key of :data:`PUBLISHED`. No checksum is published for the engine, C60 and the hand of Table 5.2:
             download them by hand and use :func:`~holotorch.io.volumes.load_volume`.
@@ -79,9 +83,25 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     entry = PUBLISHED[name]
     folder = Path(directory) if directory is not None else cache_folder()
     file = folder / entry.url.rsplit("/", 1)[1]
-    try:
-        pooch.retrieve(entry.url, known_hash=f"sha512:{entry.sha512}", fname=file.name, path=folder)
-    except OSError as error:  # includes the errors of the requests library
-        reason = textwrap.shorten(str(error), 80, placeholder=" ...")
-        raise OSError(f"could not fetch {entry.url} ({reason}); download it and put it at {file}") from error
+    cause = None
+    if file.is_file() or file not in _failed:
+        known, load = f"sha512:{entry.sha512}", pooch.HTTPDownloader(timeout=_TIMEOUT)
+        try:
+            pooch.retrieve(entry.url, known, file.name, folder, downloader=load)  # type: ignore[arg-type]
+            _failed.pop(file, None)
+        except OSError as error:  # includes the errors of the requests library
+            cause, _failed[file] = error, _reason(error)
+    if reason := _failed.get(file):
+        raise OSError(f"could not fetch {entry.url} ({reason}); download it and put it at {file}") from cause
     return load_volume(file, spacing=1, unit="relative", shape=entry.shape, dtype=entry.dtype)
+
+
+def _reason(error: OSError) -> str:
+    """Why a download failed, in a few words: those of the requests library repeat the address."""
+    from requests.exceptions import ConnectionError, Timeout
+
+    if isinstance(error, Timeout):
+        return f"no answer in {_TIMEOUT} s"
+    if isinstance(error, ConnectionError):
+        return "no connection"
+    return textwrap.shorten(str(error), 80, placeholder=" ...")

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from holotorch.core import checks
 
+_LITTLE = 1e-4  # weight of equal powers beside that of the colour, in units of the matching functions
+
 
 def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
     """CIE 1931 colour-matching functions (2 degrees) for X, Y and Z at K wavelengths in metres, float64 [3, K].
@@ -83,22 +85,44 @@ def white_balance(wavelengths: Sequence[float]) -> Tensor:
     return powers / powers.max()
 
 
-def picture_matrix(wavelengths: Sequence[float]) -> Tensor:
-    """Matrix [3, K] from intensities at K = 1, 2 or 3 wavelengths to the linear sRGB of a picture, float64.
+def _even_balance(wavelengths: Sequence[float]) -> Tensor:
+    """Powers of more than three sources that together have the colour D65, as equal as they can be, float64 [K].
 
-    Equal intensities at three wavelengths are neutral grey, see :func:`white_balance`. Two wavelengths are shown in
-    their own colours, each as bright as sRGB allows and mixed with grey as by ``optics.gamut_map``. A single one is
+    ValueError for wavelengths that cannot be mixed to D65.
+    """
+    from colour.models import RGB_COLOURSPACE_sRGB
+    from scipy.optimize import nnls
+
+    matching = tristimulus(wavelengths).numpy()
+    white = np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3)
+    # Nonnegative least squares: the colour first, and among all powers of this colour those of least variance.
+    uneven = _LITTLE * (np.eye(len(wavelengths)) - 1 / len(wavelengths))
+    powers, _ = nnls(np.concatenate([matching, uneven]), np.concatenate([white, np.zeros(len(wavelengths))]))
+    if np.linalg.norm(matching @ powers - white) > 1e-3 * np.linalg.norm(white):
+        listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
+        raise ValueError(f"{listed} nm cannot be mixed to the white D65; take red, green and blue ones too")
+    return torch.from_numpy(powers / powers.max())
+
+
+def picture_matrix(wavelengths: Sequence[float]) -> Tensor:
+    """Matrix [3, K] from intensities at K wavelengths to the linear sRGB of a picture, float64.
+
+    Equal intensities at three or more wavelengths are neutral grey, with powers as of :func:`white_balance`; those of
+    more than three are as equal as they can be. Two wavelengths are shown in their own colours, each as bright as sRGB
+    allows and mixed with grey as by ``optics.gamut_map``. A single one is
     shown in grey, whatever its colour.
 
     Raises:
-        ValueError: Another number of wavelengths, or wavelengths that have no colour or cannot be mixed to white.
+        ValueError: No wavelengths, or wavelengths that have no colour or cannot be mixed to white.
     """
     if len(wavelengths) == 1:
         return torch.ones(3, 1, dtype=torch.float64)
     if len(wavelengths) == 3:
         return srgb_matrix(wavelengths, white_balance(wavelengths))
+    if len(wavelengths) > 3:
+        return srgb_matrix(wavelengths, _even_balance(wavelengths))
     if len(wavelengths) != 2:
-        raise ValueError(f"expected 1, 2 or 3 wavelengths, got {len(wavelengths)}: a picture has three channels")
+        raise ValueError("expected at least one wavelength, got none")
     columns = []
     for wavelength in wavelengths:
         colour = srgb_matrix([wavelength])[:, 0]  # of luminance 1, like grey [1, 1, 1]

@@ -19,7 +19,9 @@ def load_heat_kernel(path: Path | str) -> Tensor:
     """
     path = Path(path)
     if path.suffix.lower() not in (".npy", ".csv", ".txt"):
-        raise ValueError(f"expected a heat kernel as .npy, .csv or .txt, got {path.name}")
+        picture = path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".exr")
+        reason = ": levels of a picture are no temperatures, write the rises as numbers" if picture else ""
+        raise ValueError(f"expected a heat kernel as .npy, .csv or .txt, got {path.name}{reason}")
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"more than {_MOST_BYTES >> 20} MiB")

@@ -22,7 +22,7 @@ class AdaptivePicture:
     """A picture rendered with a subset of the rays; each pixel corresponds to one ray.
 
     Attributes:
-        image: Radiance in red, green and blue, [3, h, w].
+        image: Radiance in the colours of the transfer function, [C, h, w].
         opacity: Opacity in [0, 1], [h, w].
         followed: Whether the ray of a pixel was computed, bool [h, w]; the other pixels are interpolated.
     """
@@ -65,7 +65,7 @@ def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, con
     fine = lattice.fine(first)
     second = torch.cat([part.reshape(-1, *sampler.grid.shape) for part in sampler.render(volume, fine)])
     picture = torch.where(fine, second, lattice.filled(first))
-    return AdaptivePicture(picture[:3], picture[3], lattice.coarse | fine)
+    return AdaptivePicture(picture[:-1], picture[-1], lattice.coarse | fine)
 
 
 def sample_adaptively(

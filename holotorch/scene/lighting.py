@@ -50,7 +50,7 @@ class Lighting:
             raise ValueError(f"shininess must be at least 1, got {self.shininess}")
 
     def shade(self, colour: Tensor, slopes: Tensor, rotation: Tensor, observer: float) -> Tensor:
-        """Shaded colour [3, n] of n points from their ``colour`` without lighting, [3, n].
+        """Shaded colour [C, n] of n points from their ``colour`` without lighting, [C, n].
 
         ``slopes`` [3, n] are those of :func:`slopes` along the axes (z, y, x) of the volume. ``rotation`` [3, 3] maps
         vectors in these axes to the scene. ``observer`` is -1 if the observer is on the side of lower z, else 1.
@@ -114,7 +114,7 @@ class Scattering:
         checks.whole("samples", self.samples, 1)
 
     def shade(self, colour: Tensor, lit: Tensor, rotation: Tensor, observer: float) -> Tensor:
-        """Colour [3, n] of n points in the light ``lit`` [1, n] of :meth:`illumination`."""
+        """Colour [C, n] of n points in the light ``lit`` [1, n] of :meth:`illumination`."""
         return colour * (self.ambient + self.strength * lit)
 
     def directions(self) -> Tensor:

@@ -23,7 +23,7 @@ class Step:
     plane: int  # index of the plane, from front to back
     rays: Tensor  # flat indices of the rays into the rows and columns of the window, [n]
     weight: Tensor  # transmittance up to the slab times opacity of the slab, [n]
-    colour: Tensor  # red, green, blue, [3, n]
+    colour: Tensor  # of each channel, such as red, green, blue, [C, n]
 
 
 @dataclass(eq=False)
@@ -48,6 +48,7 @@ class March:
     def __post_init__(self) -> None:
         volume, place, transfer, rays = self.volume, self.place, self.transfer, self.rays
         self.dtype, self.device = transfer.colours.dtype, volume.values.device
+        self.channels = transfer.colours.shape[1]
         if volume.values.is_floating_point():
             self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
         low, high = volume.bricks(BRICK)
@@ -98,8 +99,8 @@ class March:
             yield Step(plane, sampled.rays, weight, colour)
 
     def picture(self, wanted: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Red, green and blue [3, h, w], and opacity [h, w], summed along each ray; ``wanted`` as in :meth:`steps`."""
-        image, opacity = self.zeros(3), self.zeros(1)
+        """Colours [C, h, w] and opacity [h, w], summed along each ray; ``wanted`` as in :meth:`steps`."""
+        image, opacity = self.zeros(self.channels), self.zeros(1)
         for step in self.steps(wanted):
             image.index_add_(1, step.rays, step.weight * step.colour)
             opacity.index_add_(1, step.rays, step.weight[None])
@@ -108,23 +109,24 @@ class March:
     def amplitudes(
         self, wanted: Tensor | None = None, fill: Callable[[Tensor], Tensor] | None = None
     ) -> Iterator[Tensor]:
-        """Yield the square root of the radiance, [3, h, w], for every plane.
+        """Yield the square root of the radiance, [C, h, w], for every plane.
 
         ``wanted`` as in :meth:`steps`; ``fill`` completes the radiance of a plane, for rays parallel to the axis.
         """
         # One zero, expanded to the shape of a plane without allocating it.
-        dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
+        dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(self.channels, *self.rays.grid.shape)
         done = 0
         for step in self.steps(wanted):
             yield from [dark] * (step.plane - done)
             done = step.plane + 1
             scale, radiance = self.rays.scale(self.depths[step.plane]), step.weight * step.colour
+            window = self.zeros(self.channels)
             if fill is not None:
-                yield safe_sqrt(fill(self.whole(self.zeros(3).index_copy_(1, step.rays, radiance))))
+                yield safe_sqrt(fill(self.whole(window.index_copy_(1, step.rays, radiance))))
             elif scale == 1:
-                yield self.whole(self.zeros(3).index_copy_(1, step.rays, safe_sqrt(radiance)))
+                yield self.whole(window.index_copy_(1, step.rays, safe_sqrt(radiance)))
             else:
-                yield safe_sqrt(self._resampled(self.zeros(3).index_copy_(1, step.rays, radiance), scale))
+                yield safe_sqrt(self._resampled(window.index_copy_(1, step.rays, radiance), scale))
         yield from [dark] * (len(self.depths) - done)
 
     def zeros(self, channels: int) -> Tensor:
@@ -163,7 +165,7 @@ class March:
         return SliceReader(*common, channels)
 
     def _resampled(self, window: Tensor, scale: float) -> Tensor:
-        """Radiance of the rays of the window, [3, n], interpolated linearly at the points of the grid, [3, h, w].
+        """Radiance of the rays of the window, [C, n], interpolated linearly at the points of the grid, [C, h, w].
 
         At the depth of the plane, the rays are ``scale`` times as far from the axis as the points of the grid.
         """

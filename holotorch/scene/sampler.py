@@ -115,7 +115,7 @@ class DVRSampler(nn.Module):
         """Light sources of ``volume``; the planes are composited one by one as the result is iterated.
 
         ``rays``, bool [h, w], selects the rays to compute, by default all. The others have no sources unless ``fill``
-        adds them: a function from the radiance of a plane [3, h, w], 0 where no ray was computed, to that of all rays.
+        adds them: a function from the radiance of a plane [C, h, w], 0 where no ray was computed, to that of all rays.
 
         Raises:
             ValueError: A voxel is NaN or infinite, the eye is not in front of the slabs, or ``fill`` and ``eye`` are
@@ -127,17 +127,17 @@ class DVRSampler(nn.Module):
         phase = self.phase(self.grid) if self.phase is not None else None
         if not isinstance(phase, PointPhases):
             common = phase if phase is None else phase.to(march.device, march.dtype)
-            return SourceLayers(self.grid, self.depths, 3, partial(march.amplitudes, rays, fill), common)
+            return SourceLayers(self.grid, self.depths, march.channels, partial(march.amplitudes, rays, fill), common)
         factors = phasor(phase.phase.to(march.device, march.dtype))
 
         def amplitudes() -> Iterator[Tensor]:
             for plane, amplitude in enumerate(march.amplitudes(rays, fill)):
                 yield _with_phase(amplitude, phase.window(factors, plane))
 
-        return SourceLayers(self.grid, self.depths, 3, amplitudes)
+        return SourceLayers(self.grid, self.depths, march.channels, amplitudes)
 
     def render(self, volume: Volume, rays: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Picture of ``volume``: red, green and blue [3, h, w], and opacity [h, w], summed along each ray.
+        """Picture of ``volume``: colours [C, h, w] (red, green and blue), and opacity [h, w], summed along each ray.
 
         ``rays``, bool [h, w], selects the rays to compute, by default all; the other pixels stay black.
         """
@@ -154,12 +154,12 @@ class DVRSampler(nn.Module):
         emission, opacity = [], []
         for depth, span in zip(march.depths, march.spans, strict=True):
             alone = replace(march, depths=[depth], spans=[span])
-            sums = alone.zeros(4)
+            sums = alone.zeros(alone.channels + 1)
             for step in alone.steps():
                 sums.index_add_(1, step.rays, torch.cat([step.weight * step.colour, step.weight[None]]))
             whole = alone.whole(sums)
-            emission.append(whole[:3])
-            opacity.append(whole[3])
+            emission.append(whole[:-1])
+            opacity.append(whole[-1])
         return SlabLayers(self.grid, self.depths, torch.stack(emission), torch.stack(opacity))
 
     def slab_error(self, volume: Volume) -> float:

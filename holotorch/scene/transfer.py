@@ -21,7 +21,8 @@ class TransferFunction(nn.Module):
 
     Args:
         positions: Values of the volume, rising, shape [K], K >= 2.
-        colours: Red, green, blue in [0, 1] at the positions, shape [K, 3]: radiance of an opaque medium.
+        colours: Red, green, blue in [0, 1] at the positions, shape [K, 3]: radiance of an opaque medium. More than
+            three channels, such as one for each wavelength, are allowed.
         opacities: Opacity in [0, 1] at the positions, shape [K]: fraction of the light that is absorbed along
             ``unit_distance``.
         unit_distance: Distance as a fraction of the longest side of the volume, so that the picture does not depend on
@@ -49,7 +50,7 @@ class TransferFunction(nn.Module):
         if position.ndim != 1 or count < 2:
             raise ValueError(f"positions must be a list of at least 2 values, got shape {tuple(position.shape)}")
         for name, axes, values, shape in (
-            ("colours", "(K, 3)", colour, (count, 3)),
+            ("colours", "(K, 3)", colour, (count, max(3, colour.shape[-1]) if colour.ndim == 2 else 3)),
             ("opacities", "(K,)", opacity, (count,)),
         ):
             if tuple(values.shape) != shape:
@@ -67,7 +68,7 @@ class TransferFunction(nn.Module):
         self.opacities = nn.Parameter(opacity, requires_grad=False)
 
     def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Colour [3, ...], and opacity [...] per unit distance, for ``values`` [...].
+        """Colour [C, ...] of C = 3 or more channels, and opacity [...] per unit distance, for ``values`` [...].
 
         The dtype is the more precise one of values and colours. The result is also differentiable in the values; at one
         of ``positions`` the derivative is that of the interval above it.
@@ -80,9 +81,11 @@ class TransferFunction(nn.Module):
         table = torch.cat([self.colours.T, self.opacities[None]]).clamp(0, 1).to(dtype)
         flat = interval.reshape(-1)
         fraction = ((values - positions[:-1][interval]) * (1 / positions.diff())[interval]).clamp(0, 1)
-        start, step = (part.index_select(1, flat).reshape(4, *values.shape) for part in (table[:, :-1], table.diff()))
+        start, step = (
+            part.index_select(1, flat).reshape(len(table), *values.shape) for part in (table[:, :-1], table.diff())
+        )
         result = torch.addcmul(start, step, fraction)
-        return result[:3], result[3]
+        return result[:-1], result[-1]
 
     def visible(self, low: Tensor, high: Tensor) -> Tensor:
         """Whether any value from ``low`` [...] to ``high`` [...] has an opacity above 0, bool [...].

@@ -137,6 +137,16 @@ def test_a_target_of_another_shape_is_not_broadcast(shape):
         problem(torch.rand(3, *GRID.shape))
 
 
+@pytest.mark.parametrize("shape", [(12, 17), (2, 12, 17), (3, 12, 16)])
+def test_a_phase_of_another_shape_is_named_as_the_phase(shape):
+    problem = PECProblem(ThermalCrosstalk(0.66), Fraunhofer(GRID, [WAVE] * 3), torch.ones(3, *GRID.shape))
+    wanted = (3, *GRID.shape)
+    for call in (problem, problem.intensity):
+        with pytest.raises(ValueError) as caught:
+            call(torch.rand(shape))
+        assert str(caught.value) == f"phase must end in (C, H, W) = {wanted}, got {shape}"
+
+
 @pytest.mark.parametrize(
     ("target", "error", "message"),
     [

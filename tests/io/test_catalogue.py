@@ -1,7 +1,9 @@
+import dataclasses
 import hashlib
 import http.server
 import json
 import re
+import socket
 import threading
 
 import numpy as np
@@ -65,6 +67,32 @@ def test_other_content_is_refused_and_not_kept(published, values, tmp_path):
     (published[0] / "dot_6x5x4_uint8.raw").write_bytes(values.tobytes())
     (tmp_path / "cache" / "dot_6x5x4_uint8.raw").write_bytes(b"damaged")
     np.testing.assert_array_equal(fetch_volume("dot", tmp_path / "cache").values.numpy(), values)
+
+
+def test_what_could_not_be_fetched_is_not_asked_for_again_until_it_is_there(published, values, tmp_path):
+    web, asked = published
+    (web / "dot_6x5x4_uint8.raw").unlink()
+    messages, counts = [], []
+    for folder in ("cache", "cache", "cache", "elsewhere"):  # another folder is another question
+        with pytest.raises(OSError, match="404") as caught:
+            fetch_volume("dot", tmp_path / folder)
+        messages.append(str(caught.value))
+        counts.append(len(asked))
+    assert messages[0] == messages[1] == messages[2] != messages[3]
+    assert 0 < counts[0] == counts[1] == counts[2] < counts[3]
+    (tmp_path / "cache" / "dot_6x5x4_uint8.raw").write_bytes(values.tobytes())
+    np.testing.assert_array_equal(fetch_volume("dot", tmp_path / "cache").values.numpy(), values)
+
+
+def test_without_a_network_the_message_is_short(published, tmp_path, monkeypatch):
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))  # bound and not listening: connections are refused
+        url = f"http://127.0.0.1:{one.getsockname()[1]}/dot_6x5x4_uint8.raw"
+        monkeypatch.setitem(PUBLISHED, "dot", dataclasses.replace(PUBLISHED["dot"], url=url))
+        with pytest.raises(OSError) as caught:
+            fetch_volume("dot", tmp_path)
+    place = tmp_path / "dot_6x5x4_uint8.raw"
+    assert str(caught.value) == f"could not fetch {url} (no connection); download it and put it at {place}"
 
 
 def test_without_a_server_it_says_where_to_put_the_file(published, values, tmp_path):

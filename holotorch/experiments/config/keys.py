@@ -14,7 +14,7 @@ from pydantic_core import PydanticUndefined
 from holotorch.experiments.config.meanings import MEANINGS
 from holotorch.experiments.config.settings import kelvin, metres, radians
 
-_LIMITS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
+_LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 # Quantity by the name of the validator that reads its unit.
 _QUANTITIES = {metres.__name__: "length", radians.__name__: "phase", kelvin.__name__: "temperature"}
 _UNITS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
@@ -107,9 +107,7 @@ def _quantity(parts: Sequence[Any]) -> str:
 def _values(annotation: Any, metadata: Sequence[Any], quantity: str) -> str:
     """Allowed values, in words."""
     origin, inside = typing.get_origin(annotation), typing.get_args(annotation)
-    limits = " and ".join(
-        f"{sign} {getattr(each, name):g}" for each in _flat(metadata) for name, sign in _LIMITS if hasattr(each, name)
-    )
+    limits = _limits(metadata)
     if origin is typing.Annotated:
         return _values(inside[0], [*inside[1:], *metadata], quantity)
     if origin is typing.Literal:
@@ -121,6 +119,17 @@ def _values(annotation: Any, metadata: Sequence[Any], quantity: str) -> str:
         return f"list of {items[0]}" if Ellipsis in inside else f"[{', '.join(items)}]"
     words = {bool: "true | false", int: "whole number", str: "text", float: quantity or "number"}
     return " ".join(filter(None, (words.get(annotation, "value"), limits)))
+
+
+def _limits(metadata: Sequence[Any]) -> str:
+    """The tightest lower bound and the tightest upper bound, in words."""
+    every = [(name, getattr(each, name)) for each in _flat(metadata) for name in _LIMITS if hasattr(each, name)]
+    lower = [(value, name) for name, value in every if name in ("ge", "gt")]
+    upper = [(value, name) for name, value in every if name in ("le", "lt")]
+    # Of two equal bounds the tighter one is that without the equality.
+    tightest = [max(lower, key=lambda bound: (bound[0], bound[1] == "gt"))] if lower else []
+    tightest += [min(upper, key=lambda bound: (bound[0], bound[1] == "le"))] if upper else []
+    return " and ".join(f"{_LIMITS[name]} {value:g}" for value, name in tightest)
 
 
 def _flat(metadata: Sequence[Any]) -> Iterator[Any]:

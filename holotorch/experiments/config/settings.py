@@ -32,6 +32,17 @@ def metres(value: Any) -> Any:
     return number(value)
 
 
+_COLOURS = ("red", "orange", "amber", "yellow", "green", "cyan", "blue", "violet", "white", "rgb")
+
+
+def _no_name(value: Any) -> Any:
+    """An error for the name of a colour in place of its wavelength."""
+    if isinstance(value, str) and value.strip().lower() in _COLOURS:
+        usual = "usual are 630 nm for red, 530 nm for green, 450 nm for blue"
+        raise PydanticCustomError("wavelength", f"expected a wavelength in nm ({usual})")
+    return value
+
+
 _PI = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)?)\s*\*?\s*(?:pi|π)")
 _RISE = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*(?:K|degC|°C)")
 
@@ -130,7 +141,7 @@ Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
 Phase = Annotated[float, BeforeValidator(radians), Field(ge=0.1, le=1000, allow_inf_nan=False)]
 TemperatureRise = Annotated[float, BeforeValidator(kelvin), Field(ge=1, le=1e5, allow_inf_nan=False)]
-Wavelength = Annotated[Length, plausible(WAVELENGTH)]
+Wavelength = Annotated[Length, plausible(WAVELENGTH), BeforeValidator(_no_name)]
 Distance = Annotated[Length, plausible(PLANE)]  # from the hologram to an image or a plane, on either side
 Pitch = Annotated[Length, plausible(PITCH)]
 ExistingPath = Annotated[str, existing(lambda value: Path(value).exists(), _no_path)]

@@ -53,7 +53,7 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
     if isinstance(data, dict) and not mistakes:
         source.data = data
         for word in overrides:
-            _override(source, word, mistakes)
+            override(source, word, mistakes)
     elif not mistakes:
         problem = f"the file is empty; expected {wanted}" if data is None else f"expected {wanted}, got {short(data)}"
         mistakes.append(f"{path}:1:1: {problem}")
@@ -63,7 +63,8 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
     return source
 
 
-def _override(source: Source, word: str, mistakes: list[str]) -> None:
+def override(source: Source, word: str, mistakes: list[str]) -> None:
+    """Apply ``key.sub=value`` to the data of ``source``; a word that cannot be applied is added to ``mistakes``."""
     name, equals, text = word.partition("=")
     key = tuple(name.split("."))
     if not equals or not all(key):

@@ -13,7 +13,7 @@ from holotorch.experiments.eye.experiment import PRESETS, Observer
 from holotorch.experiments.runs.figures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
 
-_COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of up to three wavelengths
+_COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of the first wavelengths
 _ROMAN = ("none", "I", "II", "III")  # names of the regions 0 to 3 of ``display_geometry.region``
 _REGIONS = (  # meanings of the regions
     "no light of the point reaches the hologram",
@@ -125,7 +125,8 @@ def draw(eye: Observer) -> bytes:
     _draw_display(along, eye)
     _draw_regions(regions, eye)
     for source in eye.settings.light.sources:
-        for wavelength, colour in zip(eye.scene.settings.wavelengths, _COLOURS, strict=False):
+        for c, wavelength in enumerate(eye.scene.settings.wavelengths):
+            colour = _COLOURS[c] if c < len(_COLOURS) else f"C{c + 1}"
             spectrum = PRESETS[source](wavelength)
             band = np.linspace(*spectrum.band(), 201)
             power = spectrum.power(band).numpy()

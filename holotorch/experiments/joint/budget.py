@@ -53,8 +53,8 @@ def choose_planes(settings: JointSettings, slab_error: Callable[[int], float]) -
 
 
 def taps(settings: JointSettings) -> int | None:
-    """Taps of the heat kernel per axis; None for all that are needed, if the run has no tolerance."""
-    if settings.tolerance is None:
+    """Taps of a Gaussian heat kernel per axis; None for all that are needed, if the run has no tolerance."""
+    if settings.tolerance is None or settings.display.kernel is not None:
         return None
     share = Budget(settings.tolerance, _parts(settings, 0.0, 0.0)).share(HEAT)
     chosen = correction.cropped_taps(settings.display.sigma_px, share, _heaters(settings))
@@ -87,8 +87,10 @@ def solver_dtype(settings: JointSettings, budget: Budget) -> torch.dtype:
 
 def _begun(settings: JointSettings, error_of_planes: float, error_of_edges: float) -> Budget:
     """The budget after the taps of the heat kernel are chosen."""
-    sigma_px, chosen = settings.display.sigma_px, taps(settings)
     budget = Budget(settings.tolerance, _parts(settings, error_of_planes, error_of_edges))
+    if settings.display.kernel is not None:
+        return budget
+    sigma_px, chosen = settings.display.sigma_px, taps(settings)
     chosen = 2 * ThermalCrosstalk(sigma_px).radius + 1 if chosen is None else chosen
     budget.share(HEAT)
     budget.predict(HEAT, correction.cropping_error(sigma_px, chosen, _heaters(settings)))
@@ -98,14 +100,14 @@ def _begun(settings: JointSettings, error_of_planes: float, error_of_edges: floa
 def _parts(settings: JointSettings, error_of_planes: float, error_of_edges: float) -> list[Part]:
     """The parts in the order in which they are planned, with their errors in a run without tolerance.
 
-    Such a run takes all steps, whatever error remains.
+    Such a run takes all steps, whatever error remains. The number of taps of a measured heat kernel is given.
     """
     given = error_of_planes if settings.display.planes is not None else None
     heat = correction.cropping_error(
         settings.display.sigma_px, 2 * ThermalCrosstalk(settings.display.sigma_px).radius + 1, _heaters(settings)
     )
     parts = [
-        Part(HEAT, heat),
+        *([Part(HEAT, heat)] if settings.display.kernel is None else []),
         Part(SLABS, error_of_planes, "display.planes", given),
         Part(PROPAGATION, error_of_edges),
     ]

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field
 from holotorch.core.quantities import SIGMA_PX
 from holotorch.experiments.config.settings import (
     Count,
+    ExistingPath,
     GridSettings,
     Number,
     Phase,
@@ -32,8 +33,8 @@ class DisplaySettings(GridSettings):
     ``distance``: distance of the volume's middle. ``depth``: the volume is stretched along the axis to this extent,
     since one as deep as it is wide would be sharp at every focus; not stretched by default. ``planes``: number of
     planes that hold its light; by default 5, or as many as the tolerance of the run needs (up to 64, with slabs one
-    per frame).
-    ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
+    per frame). ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``kernel``: in its place, whatever
+    ``sigma_px`` says, a measured one, a NumPy or CSV file as in runs of kind pec. ``max_phase``: upper limit in rad on
     the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm). ``max_temperature``: in its place a
     limit on the temperature of every pixel above ambient, such as 500 degC, which gives
     one limit in phase for all colours. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
@@ -43,6 +44,7 @@ class DisplaySettings(GridSettings):
     depth: Depth | None = None
     planes: Annotated[Count, Field(le=64)] | None = None
     sigma_px: Annotated[Number, plausible(SIGMA_PX)] = 0.66
+    kernel: ExistingPath | None = None
     max_phase: Phase = 4 * math.pi
     max_temperature: TemperatureRise | None = None
     rad_per_K: Annotated[Number, Field(ge=1e-5, le=10)] = math.pi / 175
@@ -86,9 +88,9 @@ class JointReport(Settings):
 class JointSettings(Settings):
     """A volume shown by ``frames`` heater patterns in turn, optimised together for what an eye sees at every focus.
 
-    One wavelength shows the mean of the volume's colours, three show red, green and blue. ``steps``: largest number of
-    L-BFGS steps. ``light_weight``: weight of the light that misses the pupil or the window, against the error of
-    the images.
+    One wavelength shows the mean of the volume's colours, three show red, green and blue, others share these as in runs
+    of kind volume. ``steps``: largest number of L-BFGS steps. ``light_weight``: weight of the light that misses the
+    pupil or the window, against the error of the images.
     ``heat``: heat that is left from earlier frames is part of the model; by default each frame starts cold.
     ``tolerance``: allowed relative L2 error of the images, divided between the taps of the heat kernel, the planes
     (``display.planes``), the padding and precision of the propagation, and the stopping rule; without it all steps are
@@ -96,8 +98,7 @@ class JointSettings(Settings):
     """
 
     elsewhere: ClassVar[dict[str, str]] = {
-        "modulator": "display describes the chip, by sigma_px, max_phase or max_temperature, and rad_per_K; a measured "
-        "kernel is of kind pec only, whose check tells the sigma_px that fits it best",
+        "modulator": "display describes the chip, by sigma_px or kernel, max_phase or max_temperature, and rad_per_K",
         "hologram": "display has shape, pitch, distance and planes",
     }
 
@@ -134,8 +135,8 @@ def volume_settings(settings: JointSettings, planes: int | None = None) -> dict[
     display = settings.display
     hologram = {"shape": display.shape, "pitch": display.pitch, "distance": display.distance}
     hologram["depths"] = (display.planes or PLANES) if planes is None else planes
-    # The renderer knows three colours; one wavelength shows their mean.
-    wavelengths = settings.wavelengths if len(settings.wavelengths) == 3 else settings.wavelengths[:1] * 3
+    # A single wavelength shows the mean of three rendered colours.
+    wavelengths = settings.wavelengths if len(settings.wavelengths) > 1 else settings.wavelengths * 3
     same = {name: getattr(settings, name) for name in ("seed", "device", "volume", "transfer", "view")}
     return {"experiment": "volume", "hologram": hologram, "wavelengths": wavelengths, **same}
 
@@ -145,8 +146,8 @@ def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
     from holotorch.experiments.volume import config as volume
 
     problems: list[tuple[Key, str]] = []
-    if (count := len(settings.wavelengths)) not in (1, 3):
-        return [(("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {count}")]
+    if not settings.wavelengths:
+        return [(("wavelengths",), "expected 1 (grey), 3 (red, green, blue) or another number, got 0")]
     display = settings.display
     renamed: dict[Key, Key] = {("hologram", "distance"): ("display", "distance")}
     scene = volume.VolumeSettings.model_validate(volume_settings(settings))

@@ -16,7 +16,7 @@ from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.joint import budget as shares
 from holotorch.experiments.joint.config import JointSettings, volume_settings
-from holotorch.experiments.planning.correction import PROPAGATION
+from holotorch.experiments.planning.correction import PROPAGATION, measured_crosstalk
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.experiment import VolumeExperiment
@@ -108,8 +108,8 @@ class JointExperiment:
         """Colours and opacities of the planes, at their stretched depths."""
         with torch.no_grad():
             layers = self.scene.sampler().slab_layers(self.scene.volume)
-        grey = len(self.settings.wavelengths) == 1
-        emission = layers.emission.mean(1, keepdim=True) if grey else layers.emission
+        count = len(self.settings.wavelengths)
+        emission = layers.emission.mean(1, keepdim=True) if count == 1 else layers.emission[:, :count]
         return replace(layers, depths=self.depths, emission=emission)
 
     @cached_property
@@ -218,8 +218,11 @@ class JointExperiment:
     @cached_property
     def crosstalk(self) -> ThermalCrosstalk:
         """The spreading of the heat in the steady state."""
+        display = self.settings.display
+        if display.kernel is not None:
+            return measured_crosstalk(display.kernel, display.shape, "display.kernel").to(self.device)
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan states the error
-            return ThermalCrosstalk(self.settings.display.sigma_px, shares.taps(self.settings)).to(self.device)
+            return ThermalCrosstalk(display.sigma_px, shares.taps(self.settings)).to(self.device)
 
     @cached_property
     def heat(self) -> ThermalCrosstalk | HeatCycle:
@@ -290,7 +293,7 @@ class JointExperiment:
 
 
 def build(settings: JointSettings) -> JointExperiment:
-    """Load the inputs. ConfigError for a volume or transfer function that cannot be read or used."""
+    """Load the inputs. ConfigError for a volume, transfer function or heat kernel that cannot be read or used."""
     scene = build_volume(VolumeSettings.model_validate(volume_settings(settings)))
 
     def with_planes(count: int) -> VolumeExperiment:
@@ -299,4 +302,6 @@ def build(settings: JointSettings) -> JointExperiment:
     def slab_error(count: int) -> float:
         return with_planes(count).sampler().slab_error(scene.volume)
 
-    return JointExperiment(settings, with_planes(shares.choose_planes(settings, slab_error)))
+    experiment = JointExperiment(settings, with_planes(shares.choose_planes(settings, slab_error)))
+    _ = experiment.crosstalk  # read now, so that its errors are reported
+    return experiment

@@ -9,6 +9,7 @@ from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.methods import Shown
 from holotorch.experiments.joint.names import NAMES
 from holotorch.experiments.runs import figures
+from holotorch.experiments.runs.pictures import in_colour
 from holotorch.experiments.runs.saving import Results
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_animation
@@ -44,8 +45,10 @@ def write(
 
 
 def picture(experiment: JointExperiment, images: Tensor, peak: Tensor) -> Tensor:
-    """Pictures in 0 .. 1 of images [C, V, H, W], in the colours of the volume, for a screen."""
-    return tone_map((images * experiment.colours).cpu().movedim(1, 0), peak=peak).movedim(0, 1)
+    """Pictures in 0 .. 1 of images [C, V, H, W], in the colours of the volume, for a screen; grey is [1, V, H, W]."""
+    light, wavelengths = (images * experiment.colours).cpu().movedim(1, 0), experiment.settings.wavelengths
+    light = light if len(wavelengths) == 1 else in_colour(light.float(), wavelengths)
+    return tone_map(light, peak=peak).movedim(0, 1)
 
 
 def sweep(experiment: JointExperiment, shown: Shown, peak: Tensor) -> bytes:

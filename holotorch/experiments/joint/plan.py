@@ -54,12 +54,16 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         source = f"{settings.volume.phantom} (synthetic: {volume['synthetic']})"
     stretched = f", stretched {values['stretched']:.3g} times along the axis" if display.depth is not None else ""
     heat = settings.heat
+    spread = f"heat spreads over {display.sigma_px:g} px"
+    if display.kernel is not None:
+        size = " x ".join(map(str, experiment.crosstalk.kernel.shape))
+        spread = f"heat spreads by the measured kernel {display.kernel}, {size} px"
     memory = "" if heat is None else f"; {_left(settings):.1%} of the heat is left after a frame"
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, on {len(values['foci_mm'])} planes from "
         f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
-        f"frame(s) in turn; heat spreads over {display.sigma_px:g} px, phases up to "
+        f"frame(s) in turn; {spread}, phases up to "
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient{memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",

@@ -62,6 +62,10 @@ def _fingerprint(experiment: JointExperiment) -> Fingerprint:
     _, inputs, _ = fingerprint_inputs(experiment.scene)
     settings = experiment.settings
     free = {"device", "steps"}
+    if settings.display.kernel is None:
+        free.add("display.kernel")  # checkpoints of before there was one do not have it
+    else:
+        inputs["display.kernel"] = (experiment.crosstalk.kernel,)
     if settings.tolerance is None:
         free.add("tolerance")  # checkpoints of before there was one do not have it
     if settings.tolerance is None or settings.display.planes is not None:

@@ -15,6 +15,7 @@ from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.panel.config import build_panel, load_panel
+from holotorch.experiments.panel.place import claim
 from holotorch.experiments.panel.source import PanelPhases, load_panel_phases
 from holotorch.io.files import write_json
 from holotorch.io.panel_files import read_levels, read_phases, write_levels, write_phases
@@ -47,7 +48,7 @@ def export_slm(
     Args:
         folder: Folder of the run.
         description: YAML file of the panel.
-        out: Folder for the files, new or empty; by default ``slm`` in the folder of the run.
+        out: Folder for the files, new or empty; by default ``slm``, then ``slm-002``, ... in the folder of the run.
         encoding: For a volume, one of ``source.ENCODINGS``; double phase by default.
         form: ``png`` (16 bits for a panel of more than 8 bits), ``bmp``, or ``exr`` for the phases in rad.
         overrides: ``key=value`` words for the description of the panel.
@@ -57,7 +58,7 @@ def export_slm(
 
     Raises:
         ConfigError: There is no such run, its result contains NaN, the panel has another pitch or too few pixels, or
-            the folder for the files is not empty.
+            ``out`` is not empty.
     """
     if form not in FORMATS:
         raise ConfigError([f"expected one of {', '.join(FORMATS)} as the format, got {form!r}"])
@@ -67,8 +68,7 @@ def export_slm(
     if form == "bmp" and panel.bits > 8:
         raise ConfigError([f"a BMP holds 8 bits and the panel {settings.name} has {panel.bits}; use png"])
     window = _window(source.grid, panel.grid, settings.name)
-    place = folder / "slm" if out is None else out
-    _claim(place)
+    place = claim(out, folder / "slm")
     try:
         names = _write(place, source, panel, window, form, folder, settings.name)
         report = {
@@ -176,16 +176,6 @@ def _window(hologram: Grid, panel: Grid, name: str) -> tuple:
     # Hologram and panel share the optical axis, which is at sample n // 2 of n samples.
     begin = [large // 2 - small // 2 for large, small in zip(panel.shape, hologram.shape, strict=True)]
     return (..., *(slice(start, start + part) for start, part in zip(begin, hologram.shape, strict=True)))
-
-
-def _claim(place: Path) -> None:
-    """Create a folder. ConfigError if it has files or cannot be created."""
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-        if any(place.iterdir()):
-            raise ConfigError([f"{place} holds files already; choose another --out or delete it"])
-    except OSError as error:
-        raise ConfigError([f"cannot write to {place}: {error.strerror}; choose another place with --out"]) from None
 
 
 def _write(

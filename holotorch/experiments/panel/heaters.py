@@ -16,6 +16,7 @@ from holotorch import __version__
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.experiment import build as build_joint
+from holotorch.experiments.panel.place import claim
 from holotorch.experiments.panel.source import joint_heaters, pec_heaters
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.experiment import build
@@ -60,21 +61,16 @@ def export_heaters(folder: Path, out: Path | None = None, *, bits: int = 16) -> 
     left from earlier frames is included if the run includes it; the values are then those at the end of each frame.
 
     Returns:
-        The folder of the files (``out``, by default ``heaters`` in that of the run), and the content of export.json.
+        The folder of the files (``out``, by default ``heaters``, then ``heaters-002``, ... in that of the run), and the
+        content of export.json.
 
     Raises:
-        ConfigError: There is no such run, its phases contain NaN, or the folder for the files is not empty.
+        ConfigError: There is no such run, its phases contain NaN, or ``out`` is not empty.
     """
     if not 1 <= bits <= 16:
         raise ConfigError([f"expected heaters of 1 to 16 bits, got {bits}"])
     chip = _load(folder)
-    place = folder / "heaters" if out is None else out
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-        if any(place.iterdir()):
-            raise ConfigError([f"{place} holds files already; choose another --out or delete it"])
-    except OSError as error:
-        raise ConfigError([f"cannot write to {place}: {error.strerror}"]) from None
+    place = claim(out, folder / "heaters")
     try:
         report = _export(place, chip, bits) | {"source": str(folder), "holotorch": __version__}
         write_json(place / "export.json", report)
@@ -120,11 +116,11 @@ def heaters_text(report: dict[str, Any]) -> str:
     """The export in words."""
     step, limit, peak = report["files"][0]["png_step"], report["limit_rad"], report["peak_phase_of_levels_rad"]
     warning = ""
-    # 1e-3 is less than a degree at the thesis's limit of 700; rounding to 16 bits or float32 stays far below it.
-    if limit is not None and peak > limit * (1 + 1e-3):
+    # Rounding to 16 bits exceeds it by less: half a level at each pixel, times the sum of the kernel, 7 at 1.5 px.
+    if limit is not None and peak > limit * (1 + 5e-5):
         warning = (
-            f"\nWARNING: rounded to {report['heater_bits']} bits, the heaters take the light to {peak:.4g} rad, "
-            f"{report['peak_temperature_of_levels_K']:.0f} K above ambient, and the limit of the run is {limit:.4g} "
+            f"\nWARNING: rounded to {report['heater_bits']} bits, the heaters take the light to {peak:.6g} rad, "
+            f"{report['peak_temperature_of_levels_K']:.1f} K above ambient, and the limit of the run is {limit:.6g} "
             "rad; use more bits, or compute the run for them (modulator.bits of kind pec)"
         )
     return (

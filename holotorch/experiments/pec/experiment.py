@@ -31,10 +31,9 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.pec import budget as shares
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.weight import weight_map
-from holotorch.experiments.planning.correction import solver_precision
+from holotorch.experiments.planning.correction import measured_crosstalk, solver_precision
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.runs.environment import find_device
-from holotorch.io.heat_kernels import load_heat_kernel
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
@@ -295,14 +294,7 @@ def _crosstalk(settings: PECSettings, start: str) -> ThermalCrosstalk:
     """The spreading of the heat, from the width of a Gaussian or from a measured kernel."""
     chip = settings.modulator
     if chip.kernel is not None:
-        try:
-            crosstalk = ThermalCrosstalk.from_patch(load_heat_kernel(chip.kernel))
-        except ValueError as error:
-            raise ConfigError([f"modulator.kernel: {error}"]) from error
-        if any(taps > side for taps, side in zip(crosstalk.kernel.shape, settings.grid.shape, strict=True)):
-            size = f"{crosstalk.kernel.shape[0]} x {crosstalk.kernel.shape[1]}"
-            raise ConfigError([f"modulator.kernel: {size} taps are more than the grid's {settings.grid.shape} px"])
-        return crosstalk
+        return measured_crosstalk(chip.kernel, settings.grid.shape, "modulator.kernel")
     assert chip.sigma_px is not None  # ``contradictions`` asks for one of the two
     with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan reports lost heat in a note
         return ThermalCrosstalk(chip.sigma_px, shares.taps(settings, start))

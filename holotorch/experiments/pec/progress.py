@@ -41,6 +41,7 @@ class Log:
                 self._started -= content["seconds"]
             except (KeyError, TypeError, ValueError) as error:
                 raise checkpoint.unreadable(error) from None
+        self._stages = len(experiment.stages())
         steps, done = experiment.settings.solver.max_steps, len(self.rows)
         self.bar = tqdm(total=steps, initial=done, desc="correcting", unit="step", dynamic_ncols=True)
 
@@ -64,8 +65,11 @@ class Log:
         losses = solution.losses[-1].reshape(-1, len(self.experiment.wavelengths)).mean(0).tolist()
         self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", score, *map(repr, losses)])
         self.last = solution
-        relative = (solution.losses[-1] / solution.losses[0].clamp(min=1e-30)).mean().item()
-        shown = {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
+        # Each stage has a loss of its own, so that the number is relative to the start of the stage.
+        first, stage = solution.state["inner_losses"][0], int(solution.state["stage"]) + 1
+        relative = (solution.losses[-1] / first.clamp(min=1e-30)).mean().item()
+        shown = {"stage": f"{stage}/{self._stages}"} if self._stages > 1 else {}
+        shown |= {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
         if self.checked:
             shown[self.metric] = f"{self.checked[-1][1]:.4f}"
         self.bar.set_postfix(shown, refresh=False)

@@ -4,12 +4,15 @@ All errors are relative L2 errors of the intensity that the heater phases form, 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.io.heat_kernels import load_heat_kernel
 from holotorch.modulator import ThermalCrosstalk
 
 HEAT, PROPAGATION, STOPPING = "heat", "propagation", "stopping"  # parts that share the tolerance of a run
@@ -28,6 +31,37 @@ class HeaterPhases:
     mean: float
     deviation: float
     shape: tuple[int, int]
+
+
+def measured_crosstalk(path: str, shape: Sequence[int], key: str) -> ThermalCrosstalk:
+    """The spreading of the heat by a measured kernel from a file, on an array of ``shape`` pixels (y, x).
+
+    ConfigError, with the ``key`` of the configuration that names the file, for one that cannot be used.
+    """
+    try:
+        rises = load_heat_kernel(path)
+    except ValueError as error:
+        raise ConfigError([f"{key}: {error}"]) from error
+    try:
+        crosstalk = ThermalCrosstalk.from_patch(rises)
+    except ValueError as error:
+        raise ConfigError([f"{key}: {error}{_centred(rises)}"]) from error
+    if any(taps > side for taps, side in zip(crosstalk.kernel.shape, shape, strict=True)):
+        size = f"{crosstalk.kernel.shape[0]} x {crosstalk.kernel.shape[1]}"
+        raise ConfigError([f"{key}: {size} taps are more than the {tuple(shape)} px of the array"])
+    return crosstalk
+
+
+def _centred(rises: Tensor) -> str:
+    """What to keep of a table of rises [h, w] whose warmest pixel is not in the middle; empty if it is."""
+    if not rises.numel() or not bool(rises.isfinite().all()):
+        return ""
+    row, column = divmod(int(rises.argmax()), rises.shape[1])
+    down, across = min(row, rises.shape[0] - 1 - row), min(column, rises.shape[1] - 1 - column)
+    if (2 * down + 1, 2 * across + 1) == tuple(rises.shape):
+        return ""
+    kept = f"rows {row - down + 1} to {row + down + 1} and columns {column - across + 1} to {column + across + 1}"
+    return f"; the warmest pixel is in row {row + 1}, column {column + 1} of the file: keep {kept}"
 
 
 def complete_kernel(sigma_px: float) -> ThermalCrosstalk:

@@ -8,15 +8,19 @@ from torch import Tensor
 from holotorch.io.colour_tables import picture_matrix
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
-from holotorch.optics.picture import linear_srgb
+from holotorch.optics.picture import gamut_map, linear_srgb
 
 
 def in_colour(picture: Tensor, wavelengths: Sequence[float]) -> Tensor:
-    """Picture [..., 3, H, W] of channels [..., C, H, W] at C = 1, 2 or 3 wavelengths.
+    """Picture [..., 3, H, W] of channels [..., C, H, W] at C wavelengths.
 
-    Three channels are red, green and blue as they are; fewer are shown as by ``colour_tables.picture_matrix``.
+    Three channels are red, green and blue as they are; others are shown as by ``colour_tables.picture_matrix``, of
+    more than three within the gamut of sRGB.
     """
-    return picture if len(wavelengths) == 3 else linear_srgb(picture, picture_matrix(wavelengths))
+    if len(wavelengths) == 3:
+        return picture
+    mixed = linear_srgb(picture, picture_matrix(wavelengths))
+    return gamut_map(mixed) if len(wavelengths) > 3 else mixed
 
 
 def save_picture(path: Path, picture: Tensor) -> None:

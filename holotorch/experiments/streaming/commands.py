@@ -2,6 +2,9 @@
 
 import argparse
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from holotorch.experiments.tracking.commands import FILES
@@ -13,7 +16,9 @@ _OF_PAGE = ("page", "align", "volume", "panel")  # options that need the page, a
 def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command to the parser of ``holotorch``."""
     stream = commands.add_parser("stream", help="send poses to headsets, 3D Slicer and browsers, or see what arrives")
-    stream.add_argument("sources", nargs="*", metavar="SOURCE", help="a poses.csv, or what track takes")
+    stream.add_argument(
+        "sources", nargs="*", metavar="SOURCE", help="a poses.csv, or what track takes, also: synthetic"
+    )
     receiver = "receiver, and its own headset file if it has one; may be given again"
     stream.add_argument("--to", action="append", metavar="HOST[:PORT][=FILE]", help=receiver)
     stream.add_argument("--headset", type=Path, metavar="FILE", help="send poses in its frame; see calibrate headset")
@@ -72,6 +77,32 @@ def _stream(options: argparse.Namespace) -> int:
     if options.view and not options.sources:
         stream.view(options.port)
         return OK
+    with _rendered(options):
+        return _send(options)
+
+
+@contextmanager
+def _rendered(options: argparse.Namespace) -> Iterator[None]:
+    """Context in which the source ``synthetic`` is a rendered recording, in a temporary folder."""
+    from holotorch.experiments.streaming.stream import address
+    from holotorch.experiments.tracking.config import FRAMES, SYNTHETIC
+
+    for place in options.to or ():
+        address(place.partition("=")[0])  # raises for a wrong one, before the time that rendering takes
+    if options.sources != [SYNTHETIC] or not (options.to or options.view or options.igtl is not None):
+        yield
+        return
+    from holotorch.experiments.tracking.synthetic import write_synthetic
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = write_synthetic(Path(folder, SYNTHETIC), FRAMES, camera=options.camera, catheter=options.catheter)
+        options.sources = [str(made)]
+        yield
+
+
+def _send(options: argparse.Namespace) -> int:
+    from holotorch.experiments.streaming import stream
+
     page = None
     if options.view:
         from holotorch.experiments.streaming.opening import open_page

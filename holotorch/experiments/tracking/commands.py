@@ -17,24 +17,29 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     track = commands.add_parser("track", help="a catheter's tip on every frame of a video, a folder or a camera")
     what = "video, folder of pictures or of a recording, number of a camera, or: synthetic"
     track.add_argument("source", metavar="SOURCE", help=what)
+    track.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, such as frames=10")
     track.add_argument("--out", type=Path, help="folder of the run (default: runs/track-001, ...)")
     track.add_argument("--method", default="ours", help="ours (default) or thesis")
     track.add_argument("--record", action="store_true", help="keep every frame, losslessly, to be tracked again")
-    track.add_argument("--no-video", action="store_true", help="write no overlay video")
+    track.add_argument("--no-video", action="store_true", help="write no videos")
     track.add_argument("--still", action="store_true", help="the catheter is at rest: measure its stability")
     track.add_argument("--rate", type=float, metavar="HZ", help="frames per second of a source without times")
     track.set_defaults(action=_track)
 
-    about = "a camera's intrinsics from photographs of a board, or its place on a headset from alignments"
+    about = "a camera's intrinsics from photographs, its place on a headset, or the colours of a catheter's bands"
     calibrate = commands.add_parser("calibrate", help=about)
-    what = "photographs, or folders of them; or: headset ALIGNMENTS.csv"
+    what = "photographs of a board, or folders of them; or: headset ALIGNMENTS.csv; or: catheter PHOTOGRAPH"
     calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help=what)
     board = "chessboard 9x6 25mm (default; inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250"
     calibrate.add_argument("--board", nargs="+", metavar="WORD", help=board)
     # Without this pattern, argparse would read -25mm as an option instead of an (invalid) length.
     calibrate._negative_number_matcher = re.compile(r"-\.?\d")
     calibrate.add_argument("--axes", help="of the headset's frame: RDF (default), RUB (WebXR), RUF (Unity), ...")
-    calibrate.add_argument("--out", type=Path, help="file (default: camera.yaml or headset.yaml)")
+    about = "of a catheter: where each band is on the photograph, from the tip on, in pixels, as X,Y or X0,Y0,X1,Y1"
+    calibrate.add_argument("--bands", nargs="+", metavar="PLACE", help=about)
+    about = "of a catheter: YAML file whose edges, radius and length are kept (default: configs/tracking/catheter.yaml)"
+    calibrate.add_argument("--catheter", type=Path, metavar="FILE", help=about)
+    calibrate.add_argument("--out", type=Path, help="file (default: camera.yaml, headset.yaml or catheter.yaml)")
     calibrate.set_defaults(action=_calibrate)
 
     track.add_argument(
@@ -45,8 +50,9 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _track(options: argparse.Namespace) -> int:
+    from holotorch.experiments.config.errors import ConfigError
     from holotorch.experiments.config.messages import validated
-    from holotorch.experiments.config.source import Key, Source
+    from holotorch.experiments.config.source import Key, Source, override
     from holotorch.experiments.execute import execute
     from holotorch.experiments.tracking.config import TrackSettings
 
@@ -54,7 +60,12 @@ def _track(options: argparse.Namespace) -> int:
     given |= {"video": not options.no_video, "rate_hz": options.rate}
     given |= {name: str(path) for name in ("camera", "catheter", "headset") if (path := getattr(options, name))}
     arguments: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
-    settings = validated(Source(Path("track"), {"experiment": "track", **given}, arguments), TrackSettings)
+    source, mistakes = Source(Path("track"), {"experiment": "track", **given}, arguments), list[str]()
+    for word in options.overrides:
+        override(source, word, mistakes)
+    if mistakes:
+        raise ConfigError(mistakes)
+    settings = validated(source, TrackSettings)
     folder, complete = execute(settings, options.out, "track")
     page = folder / "report.html"
     print(page if page.is_file() else folder)
@@ -64,6 +75,18 @@ def _track(options: argparse.Namespace) -> int:
 def _calibrate(options: argparse.Namespace) -> int:
     from holotorch.experiments.config.errors import ConfigError
 
+    if options.files[0] == Path("catheter"):
+        if len(options.files) != 2 or not options.bands or options.board or options.axes:
+            wanted = "calibrate catheter: expected one photograph and --bands X,Y X,Y X,Y, without --board and --axes"
+            raise ConfigError([wanted])
+        from holotorch.experiments.tracking.photograph import calibrate_catheter
+
+        out = options.out or Path("catheter.yaml")
+        _, lines = calibrate_catheter(options.files[1], options.bands, out, options.catheter)
+        print(*lines, out, sep="\n")
+        return OK
+    if options.bands or options.catheter:
+        raise ConfigError(["--bands and --catheter belong to: calibrate catheter PHOTOGRAPH"])
     if options.files[0] == Path("headset"):
         if len(options.files) != 2 or options.board:
             raise ConfigError(["calibrate headset: expected one file of alignments, and no --board"])

@@ -7,6 +7,7 @@ from pydantic import BeforeValidator, Field
 from holotorch.experiments.config.settings import Count, Number, Settings
 
 SYNTHETIC = "synthetic"
+FRAMES = 45  # of a synthetic recording: one swing of the catheter
 
 
 def _camera_number(value: Any) -> Any:
@@ -21,7 +22,7 @@ class TrackSettings(Settings):
     ``frames`` frames with true poses. ``camera``, ``catheter``: YAML files; by default, those beside the recording,
     or a synthetic camera and the dissertation's catheter if ``source`` is ``synthetic``. ``headset``: YAML file of the
     camera's place on a headset; poses are also written in its frame. ``record``: save every frame without loss for a
-    later run. ``video``: write a video with the pose drawn on every frame.
+    later run. ``video``: write a video with the pose drawn on every frame; of a synthetic recording also one without.
     ``still``: measure the tip's stability; the catheter must rest. ``rate_hz``: frames per second without time stamps.
     """
 
@@ -30,7 +31,7 @@ class TrackSettings(Settings):
     camera: str | None = None
     catheter: str | None = None
     headset: str | None = None
-    frames: Count = 45
+    frames: Count = FRAMES
     method: Literal["ours", "thesis"] = "ours"
     record: bool = False
     video: bool = True

@@ -24,9 +24,10 @@ from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.timing import timed
 from holotorch.experiments.tracking.config import SYNTHETIC, TrackSettings
 from holotorch.experiments.tracking.devices import build_headset, headset_covariance, load_headset
+from holotorch.experiments.tracking.forecast import range_text
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
 from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
-from holotorch.experiments.tracking.synthetic import compared, errors, frame_size, read_truth, write_synthetic
+from holotorch.experiments.tracking.synthetic import compared, errors, read_truth, synthetic_rig, write_synthetic
 from holotorch.io.files import append, replacing, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
@@ -127,18 +128,20 @@ def _files(settings: TrackSettings) -> tuple[Path | None, Path | None]:
 
 
 def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
-    """Describe the source, and the disk space that a recording of it needs."""
+    """Describe the source, how far away a tip can be found, and the disk space that a recording needs."""
     settings = experiment.settings
     if experiment.inputs is None:
-        height, width = frame_size(_files(settings)[0])
+        (height, width), camera, catheter = synthetic_rig(*_files(settings))
         gigabytes = recording_bytes((height, width), settings.frames) / 1e9
         size = f"{width} x {height} px, {gigabytes:.2f} GB"
-        return RunPlan(f"Source     synthetic: {settings.frames} frames are rendered first, {size}")
+        text = f"Source     synthetic: {settings.frames} frames are rendered first, {size}"
+        return RunPlan(f"{text}\n{range_text(camera, catheter)}")
     frames = experiment.inputs.frames
     height, width = frames.shape
     count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"
     count = "without end; Ctrl-C ends it" if frames.live else count
     lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
+    lines.append(range_text(experiment.inputs.camera, experiment.inputs.catheter))
     if settings.record:
         free, rate = free_bytes(Path()), recording_bytes(frames.shape, 1) * frames.rate
         text = f"{rate / 1e6:.1f} MB per second; {free / 1e9:.1f} GB free here, {free / rate:.0f} s"
@@ -166,7 +169,8 @@ def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
         return _tracked(experiment, experiment.inputs, folder)
     settings = experiment.settings
     camera, catheter = _files(settings)
-    recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, camera=camera, catheter=catheter)
+    made = {"camera": camera, "catheter": catheter, "video": settings.video}
+    recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, **made)
     inputs = _open(settings, recording)
     return _tracked(replace(experiment, inputs=inputs, truth=read_truth(recording)), inputs, folder)
 

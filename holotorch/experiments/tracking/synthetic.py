@@ -5,7 +5,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import torch
@@ -18,13 +18,15 @@ from holotorch.experiments.tracking import devices
 from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import Recorder, is_recording
-from holotorch.io.video import Frame
+from holotorch.io.video import Frame, replacing_video
+from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.evaluation.protocols import coverage
-from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.catheter import THESIS, Catheter
 from holotorch.tracking.simulation.scenery import SKIN, drape, finger
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
 RATE = 30.0  # frames per second
+VIDEO = "video.avi"  # Motion JPEG: unlike MPEG-4 it keeps the band edges sharp enough for every frame
 _SIZE = (1080, 1920)  # (H, W) for a camera without a frame size
 _TIP, _COVARIANCE = COLUMNS[5:8], COLUMNS[11:17]
 _TRUTH = ("frame", "time_s", *COLUMNS[5:11])  # columns of truth.csv
@@ -37,6 +39,8 @@ def write_synthetic(
     size: tuple[int, int] = _SIZE,
     camera: Path | None = None,
     catheter: Path | None = None,
+    *,
+    video: bool = False,
 ) -> Path:
     """Render a recording with its true poses in ``truth.csv``. Returns the folder.
 
@@ -49,19 +53,15 @@ def write_synthetic(
         size: (H, W) in pixels, for a camera without a frame size.
         camera: YAML file; by default :func:`synthetic_camera` is used.
         catheter: YAML file; by default the catheter of the thesis is used.
+        video: Whether the frames are also written as ``video.avi``, to try with what a camera would have recorded.
 
     Raises:
         ConfigError: A file cannot be used, the folder is in use, or the catheter would not be in front of the camera.
     """
-    settings = None if camera is None else devices.load_camera(find_config(camera) or camera)
-    tool = THESIS
-    if catheter is not None:
-        tool = devices.build_catheter(devices.load_catheter(find_config(catheter) or catheter))
-    size = (settings and settings.size) or size
-    model = synthetic_camera(size) if settings is None else devices.build_camera(settings)
+    size, model, tool = synthetic_rig(camera, catheter, size)
     folder = claim(out, "synthetic")
     try:
-        _render(folder, frames, World(size=size, camera=model, catheter=tool))
+        _render(folder, frames, World(size=size, camera=model, catheter=tool), video)
     except BaseException as error:
         shutil.rmtree(folder)  # the folder was empty before
         if isinstance(error, ValueError):
@@ -70,12 +70,19 @@ def write_synthetic(
     return folder
 
 
-def frame_size(camera: Path | None) -> tuple[int, int]:
-    """(H, W) of the frames that :func:`write_synthetic` renders for a camera. ConfigError for an invalid file."""
-    return (None if camera is None else devices.load_camera(find_config(camera) or camera).size) or _SIZE
+def synthetic_rig(
+    camera: Path | None, catheter: Path | None, size: tuple[int, int] = _SIZE
+) -> tuple[tuple[int, int], Camera, Catheter]:
+    """(H, W) of the frames, camera and catheter that :func:`write_synthetic` renders. ConfigError for invalid files."""
+    settings = None if camera is None else devices.load_camera(find_config(camera) or camera)
+    tool = THESIS
+    if catheter is not None:
+        tool = devices.build_catheter(devices.load_catheter(find_config(catheter) or catheter))
+    size = (settings and settings.size) or size
+    return size, synthetic_camera(size) if settings is None else devices.build_camera(settings), tool
 
 
-def _render(folder: Path, frames: int, world: World) -> None:
+def _render(folder: Path, frames: int, world: World, video: bool) -> None:
     if (folder / "images").is_dir():
         (folder / "images").rmdir()
     size, tool = world.size, world.catheter
@@ -87,7 +94,8 @@ def _render(folder: Path, frames: int, world: World) -> None:
         copies = {name: Path(temporary, name) for name in ("camera.yaml", "catheter.yaml")}
         devices.save_camera(copies["camera.yaml"], world.camera, size)
         devices.save_catheter(copies["catheter.yaml"], tool)
-        with Recorder(folder, size, RATE, "synthetic", copies) as recorder:
+        movie = replacing_video(folder / VIDEO, size, RATE) if video else nullcontext()
+        with Recorder(folder, size, RATE, "synthetic", copies) as recorder, movie as writer:
             for i in tqdm(range(frames), desc="rendering", unit="frame"):
                 phase = 2 * math.pi * i / 45
                 at = (0.05 * math.sin(phase), 0.03 * math.cos(phase))
@@ -97,7 +105,10 @@ def _render(folder: Path, frames: int, world: World) -> None:
                 covered = 20 <= i % 45 < 30
                 fingers = finger((x, y - 260 * scale), (x, y + 14 * scale), 16 * scale, SKIN) if covered else ()
                 case = world.case(f"synthetic {i}", (tip, along), lambda: cloth, occluders=tuple(fingers))
-                recorder.write(Frame(i / RATE, case.frame()))
+                pixels = case.frame()
+                recorder.write(Frame(i / RATE, pixels))
+                if writer is not None:
+                    writer.write(pixels)
                 numbers = [f"{value:.9f}" for value in torch.cat([tip, along]).tolist()]
                 rows.append(dict(zip(_TRUTH, (i, f"{i / RATE:.6f}", *numbers), strict=True)))
     write_table(folder / "truth.csv", rows)

@@ -22,6 +22,7 @@ from holotorch.experiments.config.settings import (
     several,
 )
 
+_MOST_WAVELENGTHS = 32
 Scene = Literal["tooth", "teapot", "bonsai", "engine", "c60", "hand"]
 Phantom = Literal["shells", "c60", "marschner_lobb", "gaussian_ball"]
 
@@ -156,8 +157,9 @@ class VolumeSettings(Settings):
     smooth random function of the ray; or ``constant``. ``scale`` divides pixels, rays, distances, the volume's width
     and a given number of planes, which makes a small version of a scene. Three wavelengths show red, green and blue of
     the volume; a single one shows their mean; of two, the longer one shows the mean of red and green, the shorter one
-    that of green and blue. ``tolerance``: allowed relative L2 error of
-    the refocused fields, divided between the hologram and its refocusing; without it, the two may err by 1e-3 and 3e-3.
+    that of green and blue. More share the colours by their distance from 630, 530 and 450 nm. ``tolerance``: allowed
+    relative L2 error of the refocused fields, divided between the hologram and its refocusing; without it, the two may
+    err by 1e-3 and 3e-3.
     """
 
     experiment: Literal["volume"]
@@ -193,9 +195,10 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     if isinstance(hologram.depths, tuple) and len(set(hologram.depths)) < len(hologram.depths):
         twice = next(depth for k, depth in enumerate(hologram.depths) if depth in hologram.depths[:k])
         problems.append((("hologram", "depths"), f"expected distances that all differ, got {twice:g} m twice"))
-    if (count := len(settings.wavelengths)) not in (1, 2, 3):
-        words = "expected 1 (grey), 2 or 3 (red, green, blue), since a volume has three colours to share among them"
-        problems.append((("wavelengths",), f"{words}, got {count}"))
+    if not 1 <= (count := len(settings.wavelengths)) <= _MOST_WAVELENGTHS:
+        problems.append((("wavelengths",), f"expected 1 (grey) to {_MOST_WAVELENGTHS}, got {count}"))
+    if count > 3 and len(set(settings.wavelengths)) < count:
+        problems.append((("wavelengths",), "expected wavelengths that all differ"))
     side, rays = hologram.shape, hologram.rays
     if rays is not None and (side[0] % rays or side[1] % rays or side[0] // rays != side[1] // rays):
         message = f"expected a number that divides the hologram's sides {side}, got {rays}"

@@ -37,6 +37,7 @@ _COUNTED = 1_000_000  # largest number of voxels in the histogram
 HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the tolerance of a run
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
+_PRIMARIES = 450e-9, 530e-9, 630e-9  # metres: wavelengths of a volume's blue, green and red, for more than three
 # Shares of red, green and blue that each wavelength shows, longest first, for fewer wavelengths than colours.
 _SHOWN = {1: ((1 / 3, 1 / 3, 1 / 3),), 2: ((0.5, 0.5, 0.0), (0.0, 0.5, 0.5))}
 
@@ -289,10 +290,11 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     except OSError as error:
         raise ConfigError([f"transfer.file: {error.filename}: {error.strerror}"]) from error
     try:
-        if len(settings.wavelengths) == 2:
+        if len(settings.wavelengths) == 2 or len(settings.wavelengths) > 3:
             picture_matrix(settings.wavelengths)
     except ValueError as error:
-        raise ConfigError([f"wavelengths: {error}; two wavelengths are shown in their own colours"]) from error
+        hint = "; two wavelengths are shown in their own colours" if len(settings.wavelengths) == 2 else ""
+        raise ConfigError([f"wavelengths: {error}{hint}"]) from error
     if (nearest := min(experiment.depths)) <= 0:
         raise ConfigError([f"hologram.distance: the volume extends behind the hologram, to {nearest:g} m"])
     return experiment
@@ -331,11 +333,15 @@ def _shared(transfer: TransferFunction, wavelengths: Sequence[float]) -> Transfe
     Compositing is linear in the colours, so they are mixed before the rendering instead of after it. With fewer than
     three wavelengths, the last channel is repeated.
     """
-    if (shares := _SHOWN.get(len(wavelengths))) is None:
+    if len(wavelengths) == 3:
         return transfer
-    longest_first = sorted(wavelengths, reverse=True)
-    rows = [shares[longest_first.index(wavelength)] for wavelength in wavelengths]
-    rows += rows[-1:] * (3 - len(rows))
+    if len(wavelengths) > 3:
+        shares = (np.interp(wavelengths, _PRIMARIES, colour) for colour in ((0, 0, 1), (0, 1, 0), (1, 0, 0)))
+        rows = list(zip(*shares, strict=True))
+    else:
+        longest_first = sorted(wavelengths, reverse=True)
+        rows = [_SHOWN[len(wavelengths)][longest_first.index(wavelength)] for wavelength in wavelengths]
+        rows += rows[-1:] * (3 - len(rows))
     colours = transfer.colours.detach()
     mixed = (colours @ torch.tensor(rows, dtype=colours.dtype).T).clamp(0, 1)
     opacities = transfer.opacities.detach()

@@ -93,6 +93,7 @@ class SearchLimits:
 
 
 _FLOORS, _CHECK, _SEARCH = ErrorFloors(), WidthCheck(), SearchLimits()
+MOST_SD = 2e-3  # metres: deviation of a tip above which its pose is of no use
 _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
 _EXCHANGED = "exchanged red and blue channels can cause this; state the order of the channels (ChannelOrder)"
 
@@ -146,7 +147,7 @@ class CatheterTracker(nn.Module):
         camera: Camera,
         catheter: Catheter,
         *,
-        most_sd: float = 2e-3,
+        most_sd: float = MOST_SD,
         channels: ChannelOrder | None = None,
         stations: StationPlan = STATION_PLAN,
         refinement: PhotometricFit | None = None,

@@ -60,6 +60,13 @@ def mistakes(path: Path, *overrides: str) -> list[str]:
             "wavelengths=1e99999999nm",
             "wavelengths: expected a length that a number can hold, such as 100 mm",
         ),
+        (
+            CORRECTION,
+            "wavelengths=green",
+            "wavelengths: expected a wavelength in nm (usual are 630 nm for red, 530 nm for green, 450 nm for blue), "
+            "got 'green'",
+        ),
+        (CORRECTION, "wavelengths=[630 nm, Green]", "wavelengths.1: expected a wavelength in nm"),
         (CORRECTION, "propagator={kind: fresnel, distance: 1e99999999nm}", "expected a length that a number can hold"),
         (
             CORRECTION,

@@ -1,6 +1,10 @@
 """Every key of every kind is explained, and nothing is explained that is no key."""
 
+import re
+from typing import Annotated
+
 import pytest
+from pydantic import BaseModel, Field
 
 from holotorch.cli import main
 from holotorch.experiments.config import keys as module
@@ -49,6 +53,24 @@ def test_values_defaults_and_kinds_of_section_are_in_words(capsys):
     out = capsys.readouterr().out
     assert "modulator.max_phase: phase >= 0.1 and <= 1000 or null [null]" in out
     assert "exp(-d^2/sigma^2)" in out and "solver" not in out
+
+
+def test_of_several_bounds_the_tightest_are_said():
+    class Odd(BaseModel):
+        a: Annotated[int, Field(ge=1), Field(ge=4), Field(le=9), Field(lt=9)]
+        b: Annotated[float, Field(gt=2), Field(ge=2), Field(ge=-1)]
+        c: tuple[Annotated[int, Field(ge=1), Field(gt=0)], ...]
+
+    values = {key.name: key.values for key in keys(Odd)}
+    assert values == {
+        "a": "whole number >= 4 and < 9",
+        "b": "number > 2",
+        "c": "list of whole number >= 1",
+    }
+    for kind in KINDS:
+        for key in keys(find_kind(kind).settings):
+            for each in re.split(r" or | \| |, ", key.values):
+                assert each.count(">") <= 1 and each.count("<") <= 1, key
 
 
 @pytest.mark.parametrize(("words", "said"), [(["pek"], "no kind 'pek'"), (["pec", "solvr"], "did you mean 'solver'")])

@@ -52,6 +52,49 @@ def test_the_joint_correction_is_ahead_of_every_baseline_also_where_it_was_not_t
     assert joint["stack_psnr"] > 40 and joint["held_psnr"] > 38
 
 
+def test_a_gaussian_as_a_measured_kernel_gives_what_its_sigma_gives(tmp_path):
+    """Also with heat that is left from earlier frames; up to what eight steps make of rounding errors."""
+    words = "frames=3", "steps=8", "wavelengths=[520 nm]", "heat={frame_us: 20, time_constant_us: 15}"
+    gaussian = experiment(*words, "display.sigma_px=0.8")
+    np.save(tmp_path / "kernel.npy", 40 * gaussian.crosstalk.kernel.numpy())  # in any unit
+    measured = experiment(*words, f"display.kernel={tmp_path / 'kernel.npy'}")  # sigma 0.66 px is not used
+    drive = torch.rand(3, 1, 48, 44, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    torch.testing.assert_close(measured.heat(drive), gaussian.heat(drive), rtol=0, atol=1e-12)
+    one, other = (made.solve().x for made in (gaussian, measured))
+    assert (one - other).abs().max() < 2e-2  # of 6 rad, after eight steps in float32
+    assert scores(measured, other)["stack_psnr"] == pytest.approx(scores(gaussian, one)["stack_psnr"], abs=0.05)
+    assert "heat" not in measured.budget.parts and "heat" in gaussian.budget.parts
+
+
+def test_a_measured_kernel_need_not_be_symmetric_and_is_named_by_the_plan(tmp_path, capsys):
+    kernel = np.array([[0.0, 0.1, 0.0], [0.3, 1.0, 0.05], [0.0, 0.2, 0.0]])
+    np.savetxt(tmp_path / "kernel.csv", kernel, delimiter=",")
+    made = experiment("frames=2", "steps=3", "wavelengths=[520 nm]", f"display.kernel={tmp_path / 'kernel.csv'}")
+    drive = torch.zeros(2, 1, 48, 44)
+    drive[:, :, 20, 30] = 1.0
+    np.testing.assert_allclose(made.heat(drive)[0, 0, 19:22, 29:32], kernel, atol=1e-7)
+    words = [SCENE, VOLUME[1], *PLAIN, DISPLAY, f"display.kernel={tmp_path / 'kernel.csv'}"]
+    for tolerance in ([], ["tolerance=0.1"]):
+        assert main(["check", TEAPOT, *words, *tolerance]) == 0
+        assert f"heat spreads by the measured kernel {tmp_path / 'kernel.csv'}, 3 x 3 px" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("1,2\n3", "display.kernel: {path}: expected a table of temperature rises"),
+        ("\n".join([",".join(["0.1"] * 51)] * 51), "display.kernel: 51 x 51 taps are more than the (48, 44) px of"),
+    ],
+)
+def test_a_kernel_that_cannot_be_used_is_said(rows, message, tmp_path, capsys):
+    path = tmp_path / "kernel.csv"
+    path.write_text(rows)
+    assert main(["check", TEAPOT, SCENE, VOLUME[1], *PLAIN, DISPLAY, f"display.kernel={path}"]) == 2
+    assert message.format(path=path) in capsys.readouterr().err
+    assert main(["check", TEAPOT, "modulator={kernel: a.csv}"]) == 2
+    assert "display describes the chip, by sigma_px or kernel" in capsys.readouterr().err
+
+
 def test_scarce_heat_is_where_the_model_of_it_pays():
     made = experiment("frames=6", "steps=40", "wavelengths=[520 nm]", "display.sigma_px=1.2")
     afterwards = evaluate(made, baseline(made, "unheated"))[0]
@@ -133,7 +176,7 @@ def test_a_focus_at_the_array_is_taken_and_a_plane_behind_it_is_not():
     [
         (["display.depth=13 mm"], "less than twice the distance, 0.012 m"),
         (["frames=2", "report.baselines=[slabs]"], "needs at least 4 frames, got 2"),
-        (["wavelengths=[520 nm, 450 nm]"], "expected 1 (grey) or 3"),
+        (["wavelengths=[]"], "expected 1 (grey), 3 (red, green, blue) or another number, got 0"),
         (["display.pitch=0.4 um"], "at least 0.9 of the longest wavelength"),
         (["display.distance=0.1 mm", "display.depth=null"], "display.distance: expected the whole volume in front"),
         (["display.shape=[8, 8]"], "at least 11 x 11 px"),

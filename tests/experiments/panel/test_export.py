@@ -303,6 +303,10 @@ def test_command(pec, tmp_path, capsys):
     assert json.loads((tmp_path / "a" / "export.json").read_text())["content"] == lines[-2].removeprefix("Content    ")
     assert main(words) == 2
     assert "holds files already; choose another --out" in capsys.readouterr().err
+    run = shutil.copytree(pec, tmp_path / "run")
+    for name in ("slm", "slm-002"):  # without --out, folders number themselves
+        assert main(["export-slm", str(run), "--slm", PANEL, *SMALL]) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == str(run / name)
     for extra, message in (
         (["--encoding", "kinoform"], "holds phases already, which need no encoding"),
         (["--format", "tiff"], "expected one of png, bmp, exr as the format, got 'tiff'"),

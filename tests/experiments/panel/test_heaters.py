@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from tiny_runs import RUNS
 
 from holotorch.cli import main
 from holotorch.experiments.execute import execute
-from holotorch.experiments.panel.heaters import export_heaters
+from holotorch.experiments.panel.heaters import export_heaters, heaters_text
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.view.opening import open_viewer
 from holotorch.io.panel_files import read_levels
@@ -56,6 +57,12 @@ def test_a_kernel_that_is_no_gaussian_is_said(tmp_path, capsys):
         ("kernel.csv", "1,2\n3", "expected a table of temperature rises, a line for each row of pixels"),
         ("kernel.csv", "0,1,0\n1,2,9\n0,1,0", "heated centre the warmest"),
         ("kernel.csv", "0,1\n1,2", "two odd sizes"),
+        (
+            "kernel.csv",
+            "0,0,0,0\n0,1,0,0\n1,9,2,0\n0,1,0,0",
+            "; the warmest pixel is in row 3, column 2 of the file: keep rows 2 to 4 and columns 1 to 3",
+        ),
+        ("kernel.png", "no numbers", "levels of a picture are no temperatures, write the rises as numbers"),
         ("kernel.csv", "0,1,0\n1,nan,1\n0,1,0", "nan"),
         ("kernel.npy", "no array", "expected a table"),
         ("kernel.mat", "0", "expected a heat kernel as .npy, .csv or .txt"),
@@ -115,7 +122,13 @@ def test_heater_files_say_what_they_are_and_agree(tmp_path, capsys):
         np.testing.assert_allclose(levels.numpy() * about["step"], array, atol=0.51 * about["step"] + 1e-5)
         assert (about["unit"], about["quantity"]) == (entry["unit"], entry["quantity"])
         assert entry["quantity"] != "heater" or levels.int().max() <= 255
-    assert main(["export-heaters", str(run)]) == 2 and "holds files already" in capsys.readouterr().err
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    for number in ("002", "003"):  # as folders of runs number themselves
+        assert main(["export-heaters", str(run), "--bits", "8"]) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == f"{out}-{number}"
+        assert {path.name: path.read_bytes() for path in Path(f"{out}-{number}").iterdir()} == before
+    assert main(["export-heaters", str(run), "--out", str(out)]) == 2
+    assert "holds files already" in capsys.readouterr().err
     assert main(["export-heaters", str(tmp_path)]) == 2 and "holds no run" in capsys.readouterr().err
 
 
@@ -177,6 +190,22 @@ def test_coarse_levels_above_the_limit_are_warned_of_and_files_of_near_colours_s
             peaks.append(torch.nn.functional.conv2d(driven, taps, padding=2).max().item())
     assert report["peak_phase_of_levels_rad"] == pytest.approx(max(peaks), rel=1e-9)
     assert max(peaks) > report["limit_rad"] == pytest.approx(300 * 0.03 * 630 / 532.4)
+
+
+def test_levels_above_the_limit_by_a_hair_are_warned_of_and_16_bits_are_not(tmp_path):
+    chip = "{sigma_px: 0.66, kernel_size: 5, max_phase: 6.3}"
+    run = tmp_path / "run"
+    assert main(["run", *SMALL, f"modulator={chip}", "--out", str(run)]) == 0
+    phase = torch.from_numpy(np.load(run / "arrays" / "phase.npy")).double()
+    taps = torch.from_numpy(kernel(scale=1.0)).expand(phase.shape[1], 1, 5, 5)
+    phase *= 6.3 / torch.nn.functional.conv2d(phase, taps, padding=2, groups=phase.shape[1]).max()  # at the limit
+    np.save(run / "arrays" / "phase.npy", phase.float().numpy())
+    excess = {}
+    for bits in range(6, 17):
+        _, report = export_heaters(run, bits=bits)
+        excess[bits] = report["peak_phase_of_levels_rad"] / report["limit_rad"] - 1
+        assert ("WARNING" in heaters_text(report)) == (excess[bits] > 5e-5)
+    assert excess[16] < 5e-5 and any(5e-5 < each < 1e-3 for each in excess.values())
 
 
 def test_an_export_that_fails_leaves_no_files(tmp_path, capsys, monkeypatch):

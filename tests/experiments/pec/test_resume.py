@@ -270,3 +270,21 @@ def test_resume_is_listed(capsys):
         main(["--help"])
     assert caught.value.code == 0
     assert "go on with an interrupted run" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("words", "stages"), [([LBFGS], [2, 12]), (CAPPED, [4, 3, 3, 2, 2])])
+def test_the_progress_bar_names_the_stage_and_its_loss_never_jumps_up(words, stages, monkeypatch, tmp_path):
+    """Each stage has a loss of its own; within one, every step of L-BFGS lowers it."""
+    shown = []
+
+    class Watched(Log):
+        def __call__(self, solution):
+            super().__call__(solution)
+            shown.append(dict(part.split("=") for part in str(self.bar.postfix).split(", ")))
+
+    monkeypatch.setattr(run_module, "Log", Watched)
+    assert execute(settings(*words), tmp_path / "run")[1]
+    names = [f"{k}/{len(stages)}" for k, steps in enumerate(stages, 1) for _ in range(steps)]
+    assert [each["stage"] for each in shown] == names
+    for before, after in zip([{"stage": "", "loss": ""}, *shown], shown, strict=False):
+        assert float(after["loss"]) <= (float(before["loss"]) if before["stage"] == after["stage"] else 1.0)

@@ -17,7 +17,7 @@ from holotorch.cli import main
 from holotorch.experiments import execute
 from holotorch.experiments.streaming import check as stream_check
 from holotorch.experiments.streaming import stream
-from holotorch.experiments.tracking import run
+from holotorch.experiments.tracking import run, synthetic
 from holotorch.experiments.tracking.synthetic import write_synthetic
 from holotorch.tracking.pose.status import Status
 from holotorch.tracking.streaming.packet import PosePacket, decode
@@ -98,6 +98,33 @@ def test_track_the_synthetic_source_renders_it_first(monkeypatch, capsys):
     with open("runs/track-002/synthetic/truth.csv", newline="") as stream:
         (true,) = csv.DictReader(stream)
     assert abs(float(row["tip_z_m"]) - float(true["tip_z_m"])) < 1.5e-3
+
+
+def test_track_takes_settings_as_run_does_before_and_after_options(monkeypatch, capsys):
+    taken = []
+    monkeypatch.setattr(execute, "execute", lambda settings, *_: taken.append(settings) or (Path("o"), True))
+    assert main(["track", "a.mp4", "still=true", "--no-video", "rate_hz=25", "method=thesis", "frames=3"]) == 0
+    settings = taken[0]
+    assert (settings.source, settings.still, settings.video) == ("a.mp4", True, False)
+    assert (settings.rate_hz, settings.method, settings.frames) == (25, "thesis", 3)
+    error = said(capsys, "track", "a.mp4", "frame=3")
+    assert error == "argument 'frame=3': frame: unknown setting; did you mean 'frames'?\n"
+    assert said(capsys, "track", "a.mp4", "b.mp4") == "argument 'b.mp4': expected key=value or key.sub=value\n"
+    assert "unrecognized arguments: b.mp4" in wrong(capsys, "track", "a.mp4", "--still", "b.mp4")
+
+
+def test_the_synthetic_recording_is_also_a_video_that_a_first_try_can_track(tmp_path, capsys):
+    Path("c.yaml").write_text("fx: 930\nfy: 930\ncx: 640\ncy: 360\nsize: [720, 1280]\n")
+    assert main(["track", "synthetic", "frames=2", "--camera", "c.yaml", "--out", "here"]) == 0
+    made = Path("here/synthetic")
+    files = ["--camera", str(made / "camera.yaml"), "--catheter", str(made / "catheter.yaml")]
+    assert main(["track", str(made / "video.avi"), *files, "--no-video", "--out", "again"]) == 0
+    tips = []
+    for name in ("here", "again"):
+        with open(f"{name}/poses.csv", newline="") as table:
+            tips.append([[float(row[f"tip_{axis}_m"]) for axis in "xyz"] for row in csv.DictReader(table)])
+    assert np.array(tips).shape == (2, 2, 3)
+    assert np.abs(np.subtract(*tips)).max() < 3e-3  # chroma at half the resolution: some times the error of the frames
 
 
 def test_track_says_an_interruption_by_its_status(tmp_path, monkeypatch, capsys):
@@ -322,6 +349,26 @@ def test_stream_tracks_a_recording(recording, capsys):
     poses = [packet for packet in packets if isinstance(packet, PosePacket)]
     assert [packet.pose.status for packet in poses] == [Status.OK, Status.OK]
     assert 0 < poses[1].sequence - poses[0].sequence <= 2
+
+
+def test_stream_renders_the_synthetic_source(monkeypatch, capsys):
+    def small(out, frames, **given):
+        assert frames == 45
+        return write_synthetic(out, 2, (540, 960), **given)
+
+    monkeypatch.setattr(synthetic, "write_synthetic", small)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        assert main(["stream", "synthetic", "--to", f"127.0.0.1:{receiver.getsockname()[1]}"]) == 0
+        packets = [decode(receiver.recv(4096)) for _ in range(2)]
+    assert [packet.pose.status for packet in packets if isinstance(packet, PosePacket)] == [Status.OK, Status.OK]
+
+
+def test_stream_renders_nothing_for_nobody(monkeypatch, capsys):
+    monkeypatch.setattr(synthetic, "write_synthetic", lambda *_, **__: pytest.fail("rendered"))
+    assert "say to whom" in said(capsys, "stream", "synthetic")
+    assert "expected a port from 1 to 65535" in said(capsys, "stream", "synthetic", "--to", "127.0.0.1:99999")
 
 
 LOADED = """

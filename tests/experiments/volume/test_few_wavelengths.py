@@ -1,4 +1,4 @@
-"""Holograms of volumes, and what an eye sees of them, at one and at two wavelengths."""
+"""Holograms of volumes, and what an eye sees of them, at one, at two and at more than three wavelengths."""
 
 import json
 
@@ -7,11 +7,12 @@ import pytest
 import torch
 from paths import CONFIGS
 from PIL import Image
+from tiny_runs import RUNS
 
 from holotorch.cli import main
 from holotorch.experiments.view.controls import checked
 from holotorch.experiments.view.opening import open_viewer
-from holotorch.io.colour_tables import picture_matrix
+from holotorch.io.colour_tables import picture_matrix, srgb_matrix
 
 TINY = [
     "volume={phantom: shells, samples: 24}",
@@ -23,6 +24,7 @@ SHARES = {
     "520 nm": [[1 / 3, 1 / 3, 1 / 3]],
     "636 nm, 455 nm": [[0.5, 0.5, 0], [0, 0.5, 0.5]],
     "455 nm, 636 nm": [[0, 0.5, 0.5], [0.5, 0.5, 0]],
+    "640 nm, 580 nm, 530 nm, 490 nm, 440 nm": [[1, 0, 0], [0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]],
 }
 
 
@@ -63,7 +65,43 @@ def test_each_wavelength_shows_its_share_of_the_colours(wavelengths, in_three, t
     assert len(list((tmp_path / "slm").glob("*.png"))) == len(shares)
 
 
-@pytest.mark.parametrize("wavelengths", ["520 nm", "636 nm, 455 nm"])
+@pytest.mark.parametrize("count", [4, 5, 9, 32])
+def test_equal_light_of_many_wavelengths_is_grey_and_none_is_left_out(count):
+    wavelengths = torch.linspace(650e-9, 440e-9, count, dtype=torch.float64).tolist()
+    matrix = picture_matrix(wavelengths)
+    torch.testing.assert_close(matrix.sum(1), torch.ones(3, dtype=torch.float64), atol=1e-3, rtol=0)
+    shown = torch.tensor([matrix[:, 0].argmax(), matrix[:, -1].argmax()])
+    assert shown.tolist() == [0, 2]  # the longest is reddest, the shortest bluest
+    alone = torch.tensor([srgb_matrix([each]).norm() for each in wavelengths])
+    assert (matrix.norm(dim=0) > 1e-3 * alone).all()
+
+
+def test_wavelengths_that_cannot_show_white_or_are_given_twice_are_said(capsys):
+    config = str(CONFIGS / "volume" / "tooth.yaml")
+    assert main(["check", config, *TINY, "wavelengths=[600 nm, 610 nm, 620 nm, 630 nm]"]) == 2
+    assert "600, 610, 620, 630 nm cannot be mixed to the white D65" in capsys.readouterr().err
+    assert main(["check", config, *TINY, "wavelengths=[640 nm, 530 nm, 450 nm, 450 nm]"]) == 2
+    assert "wavelengths: expected wavelengths that all differ" in capsys.readouterr().err
+    many = ", ".join(f"{400 + 5 * k} nm" for k in range(33))
+    assert main(["check", config, *TINY, f"wavelengths=[{many}]"]) == 2
+    assert "wavelengths: expected 1 (grey) to 32, got 33" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wavelengths", ["636 nm, 455 nm", "640 nm, 580 nm, 530 nm, 490 nm, 440 nm"])
+def test_a_hot_chip_shows_any_number_of_wavelengths(wavelengths, tmp_path):
+    config, *words = RUNS["joint"]
+    out, count = tmp_path / "run", len(SHARES[wavelengths])
+    words += [f"wavelengths=[{wavelengths}]", "report.baselines=[]"]
+    assert main(["run", str(CONFIGS / config), *words, "--out", str(out)]) == 0
+    assert np.load(out / "arrays" / "phase.npy").shape == (3, count, 24, 20)
+    assert np.load(out / "arrays" / "target.npy").shape[1] == count
+    viewer = open_viewer(out)
+    with torch.no_grad():
+        shown = viewer.show(checked(viewer.controls, {}), False, lambda: None)
+    assert len(shown.pictures) == 2
+
+
+@pytest.mark.parametrize("wavelengths", ["520 nm", "636 nm, 455 nm", "640 nm, 580 nm, 530 nm, 490 nm, 440 nm"])
 def test_an_eye_sees_few_wavelengths(wavelengths, tmp_path):
     change = "'volume={phantom: c60, samples: 24}', "
     change += "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 12 mm, depths: 8, rays: 32}'"
@@ -87,5 +125,5 @@ def test_two_wavelengths_are_shown_in_their_own_colours_and_one_in_grey():
     torch.testing.assert_close(
         picture_matrix([636e-9, 520e-9, 455e-9]).sum(1), torch.ones(3, dtype=torch.float64), atol=1e-3, rtol=0
     )
-    with pytest.raises(ValueError, match="expected 1, 2 or 3 wavelengths, got 4"):
-        picture_matrix([4e-7, 5e-7, 6e-7, 7e-7])
+    with pytest.raises(ValueError, match="at least one wavelength"):
+        picture_matrix([])

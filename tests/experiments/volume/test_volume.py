@@ -204,7 +204,7 @@ def test_an_empty_volume_is_black_and_said_to_be(tmp_path, capsys):
         ("volume={scene: tooht}", "did you mean 'tooth'"),
         ("transfer={preset: bone, low: 9, high: 3}", "transfer: a preset needs low < high"),
         ("transfer={}", "transfer: expected one of preset, file or points"),
-        ("wavelengths=[450 nm, 500 nm, 550 nm, 600 nm]", "wavelengths: expected 1 .grey., 2 or 3"),
+        ("wavelengths=[]", "wavelengths: expected 1 .grey. to 32, got 0"),
         ("view={lighting: true, scattering: {}}", "view.lighting: expected false with scattering"),
         ("view.scattering={towards: [0, 0, 0]}", "view.scattering: expected towards to point to the light"),
         ("scale=3", "scale: expected a divisor of the pixels"),

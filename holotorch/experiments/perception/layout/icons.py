@@ -9,6 +9,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Ellipse, FancyBboxPatch, Patch, Polygon, Rectangle
 from matplotlib.transforms import Affine2D, Transform
+from torch import Tensor
 
 
 def draw_ground(axes: Axes, field_deg: tuple[float, float]) -> None:
@@ -44,6 +45,18 @@ def draw_icon(axes: Axes, name: str, centre: tuple[float, float], size: tuple[fl
     axes.add_patch(plate)
     unit_square = Affine2D().scale(width, height).translate(left, bottom) + axes.transData
     shapes(_Pen(axes, unit_square, zorder + 0.1, colour))
+
+
+def draw_picture(
+    axes: Axes, picture: Tensor, centre: tuple[float, float], size: tuple[float, float], zorder: float
+) -> None:
+    """Draw a picture [3, h, w] from 0 to 1 as an icon, as large as fits into ``size`` (height, width) at ``centre``."""
+    pixels = picture.shape[-2:]
+    scale = min(size[0] / pixels[0], size[1] / pixels[1])
+    half_height, half_width = scale * pixels[0] / 2, scale * pixels[1] / 2
+    (x, y), rows = centre, picture.movedim(0, -1).clamp(0, 1).numpy()
+    extent = (x - half_width, x + half_width, y - half_height, y + half_height)
+    axes.imshow(rows, extent=extent, zorder=zorder, aspect="auto")
 
 
 @dataclass(frozen=True)

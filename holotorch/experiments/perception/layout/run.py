@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,18 +15,20 @@ from matplotlib.patches import Rectangle
 from torch import Tensor
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.perception.layout.config import ItemSettings, LayoutSettings, TargetPatternSettings
-from holotorch.experiments.perception.layout.icons import draw_ground, draw_icon
+from holotorch.experiments.perception.layout.config import ICONS, ItemSettings, LayoutSettings, TargetPatternSettings
+from holotorch.experiments.perception.layout.icons import draw_ground, draw_icon, draw_picture
 from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes
+from holotorch.io.images import load_image, with_channels
 from holotorch.perception import (
     FITTED_DEG,
     TABLE_2_1,
     EqualEfficiencyScale,
     ScaledLayout,
+    WideDisplay,
     check_display,
     overlaps,
     scale_layout,
@@ -42,15 +45,22 @@ _EXTRAPOLATED = ("#d35400", "--", "* extrapolated beyond 70 deg")
 
 @dataclass(frozen=True)
 class Layouts:
-    """The settings, and for each target pattern the layout that is scaled to it."""
+    """The settings, for each target pattern the layout that is scaled to it, and pictures of the user's own icons."""
 
     settings: LayoutSettings
     scaled: list[tuple[TargetPatternSettings, ScaledLayout]]
+    pictures: dict[str, Tensor]  # [3, h, w] from 0 to 1, by path
 
 
 def build_layouts(settings: LayoutSettings) -> Layouts:
-    """Scale the icons for each target. ConfigError for a target that Table 2.2 does not contain."""
-    scaled = []
+    """Scale the icons for each target. ConfigError for a target that Table 2.2 does not contain, or a wrong picture."""
+    scaled, pictures = [], {}
+    for i, item in enumerate(settings.items):
+        if item.icon not in ICONS and item.icon not in pictures:
+            try:
+                pictures[item.icon] = with_channels(load_image(item.icon), 3)
+            except (ValueError, OSError) as error:
+                raise ConfigError([f"items.{i}.icon: {error}"]) from None
     for i, target in enumerate(settings.targets):
         try:
             scale = EqualEfficiencyScale.from_table(target.size_deg, target.eccentricity_deg)
@@ -58,7 +68,7 @@ def build_layouts(settings: LayoutSettings) -> Layouts:
             raise ConfigError([f"targets.{i}: {error}"]) from None
         size = torch.full((len(settings.items), 2), target.size_deg, dtype=torch.float64)
         scaled.append((target, scale_layout(_centres(settings), size, scale, extrapolate=settings.extrapolate)))
-    return Layouts(settings, scaled)
+    return Layouts(settings, scaled, pictures)
 
 
 def layout_text(layouts: Layouts) -> str:
@@ -107,7 +117,7 @@ def _centres(settings: LayoutSettings) -> Tensor:
 
 
 def _name(item: ItemSettings) -> str:
-    return item.label or item.icon.replace("_", " ")
+    return item.label or Path(item.icon).stem.replace("_", " ")
 
 
 def _flags(settings: LayoutSettings, layout: ScaledLayout) -> dict[str, Any]:
@@ -155,9 +165,12 @@ def _rows(settings: LayoutSettings, title: str, layout: ScaledLayout) -> list[di
 
 
 def _displays(settings: LayoutSettings) -> Iterator[dict[str, Any]]:
-    """One row per display of Table 2.1: the greatest eccentricity at which it shows the icon sizes of each target."""
+    """A row for each display, the user's first: the greatest eccentricity at which it shows each target's sizes."""
     grid = torch.linspace(*FITTED_DEG, 301, dtype=torch.float64)
-    for display in TABLE_2_1:
+    own = settings.display
+    pixel = None if own is None or own.arcmin is None else (own.arcmin, own.arcmin)
+    mine = [] if own is None else [WideDisplay(own.name, own.field_deg, arcmin=pixel)]
+    for display in (*mine, *TABLE_2_1):
         row: dict[str, Any] = {"display": display.name, "half_field_deg": display.half_field_deg}
         for target in settings.targets:
             scale = EqualEfficiencyScale.from_table(target.size_deg, target.eccentricity_deg)
@@ -188,7 +201,10 @@ def _picture(layouts: Layouts) -> bytes:
         for i, item in enumerate(items):
             size: tuple[float, float] = tuple(layout.size_deg[i].tolist())  # type: ignore[assignment]
             centre = item.azimuth_deg, item.elevation_deg
-            draw_icon(axes, item.icon, centre, size, 10 + i)
+            if item.icon in ICONS:
+                draw_icon(axes, item.icon, centre, size, 10 + i)
+            else:
+                draw_picture(axes, layouts.pictures[item.icon], centre, size, 10 + i)
             colour, style, _ = _frame(layout, i)
             _box(axes, centre, size, colour, style)
             label = f"{_name(item)}\n{max(size):.1f} deg" + (" *" if layout.extrapolated[i] else "")

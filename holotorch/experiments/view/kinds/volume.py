@@ -59,7 +59,9 @@ class VolumeViewer(Viewer):
         self._stored = self._scene(volume_hologram(folder, experiment.settings), rendering, experiment, 1)
         self.transforms = len(wavelengths), *self._stored.refocusers[0].padded.shape
         self._turned: dict[int, tuple[tuple[float, float], Scene]] = {}  # the last orientation by the divisor
-        every = {1: f"{wavelengths[0] * 1e9:.0f} nm", 2: "both", 3: "all three"}[len(wavelengths)]
+        every = {1: f"{wavelengths[0] * 1e9:.0f} nm", 2: "both", 3: "all three"}.get(
+            len(wavelengths), f"all {len(wavelengths)}"
+        )
         several = enumerate(wavelengths) if len(wavelengths) > 1 else ()
         names = {f"{c}": f"{w * 1e9:.0f} nm only" for c, w in several}
         self.controls = [

@@ -5,9 +5,11 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from paths import CONFIGS
+from PIL import Image
 from skimage.metrics import structural_similarity
 
 from holotorch.cli import _parser, main
@@ -76,6 +78,50 @@ def test_icons_at_the_edge_of_the_field_are_reported(tmp_path, capsys):
     notes = [row["note"] for row in summary["items"][:3]]
     assert notes[0] == "cut by the edge of the field" and "cut" not in notes[2]
     assert "cut by the edge of the field" in (tmp_path / "a" / "report.html").read_text()
+
+
+def test_own_icons_are_drawn_in_their_place_and_size(tmp_path, monkeypatch):
+    picture = np.zeros((20, 40, 3), np.uint8)
+    picture[:, :20], picture[:, 20:] = (255, 0, 0), (0, 0, 255)
+    Image.fromarray(picture).save(tmp_path / "my_sign.png")
+    drawn = []
+    figure_png = perception_layout.figure_png
+    monkeypatch.setattr(perception_layout, "figure_png", lambda figure: [drawn.append(figure), figure_png(figure)][1])
+    items = f"items=[{{icon: {tmp_path / 'my_sign.png'}, azimuth_deg: 60}}, {{icon: boat, azimuth_deg: -20}}]"
+    assert main(["run", str(LAYOUT), items, "--out", str(tmp_path / "a")]) == 0
+    axes = drawn[0].axes[0]
+    (image,) = axes.images
+    size = 0.47 * 60 - 11.04  # the longer side has the size of the icon
+    assert image.get_extent() == pytest.approx([60 - size / 2, 60 + size / 2, -size / 4, size / 4])
+    assert [list(pixel) for pixel in image.get_array()[0, [0, -1]]] == [[1, 0, 0], [0, 0, 1]]
+    assert axes.get_xlim() == (-95, 95) and "my sign\n17.2 deg" in [text.get_text() for text in axes.texts]
+
+
+def test_an_icon_that_is_none_is_said(tmp_path, capsys):
+    assert main(["check", str(LAYOUT), "items=[{icon: coastr, azimuth_deg: 10}]"]) == 2
+    error = capsys.readouterr().err
+    assert "or a picture file (PNG, JPEG) that exists, got 'coastr'; did you mean 'coaster'?" in error
+    (tmp_path / "text.png").write_text("no picture")
+    assert main(["check", str(LAYOUT), f"items=[{{icon: {tmp_path / 'text.png'}, azimuth_deg: 10}}]"]) == 2
+    assert "items.0.icon: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("display", "wanted"),
+    [
+        # 0.47 E - 11.04 is the size at E: E + size / 2 = 50 at 44.95 deg, where 12 pixels across 10.09 deg are needed.
+        ("{field_deg: 100, arcmin: 3, name: mine}", "to 44 deg"),
+        ("{field_deg: 100, arcmin: 60, name: mine}", "to 44 deg, too coarse"),
+        ("{field_deg: 100, name: mine}", "to 44 deg, resolution unknown"),
+        ("{field_deg: 60, arcmin: 3, name: mine}", "not at 40 deg"),
+    ],
+)
+def test_an_own_display_is_checked_before_those_of_the_table(display, wanted, tmp_path):
+    assert main(["run", str(LAYOUT), f"display={display}", "--out", str(tmp_path / "a")]) == 0
+    with open(tmp_path / "a" / "displays.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert rows[0]["display"] == "mine" and rows[0]["5 deg at 10 deg"] == wanted and len(rows) == 15
+    assert "mine" in (tmp_path / "a" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("extrapolate", [False, True])

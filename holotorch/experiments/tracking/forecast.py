@@ -1,0 +1,61 @@
+"""How far away a catheter can be found by a camera, before a frame is taken."""
+
+import math
+from itertools import pairwise
+
+import torch
+
+from holotorch.tracking import Camera, Catheter, solve_pose
+from holotorch.tracking.detection.stations import AxisLimits
+from holotorch.tracking.detection.tracker import MOST_SD
+
+_SHORTEST = 22.0  # pixels: least length of a band whose ends are measured apart from each other
+_EDGE = 0.02  # pixels: deviation of an edge in good light and full colours, as on the synthetic frames of the tests
+_NEAREST, _FARTHEST, _STEPS = 0.02, 20.0, 700  # metres; steps of 1 %
+
+
+def range_text(camera: Camera, catheter: Catheter) -> str:
+    """A line with the largest distance at which ``CatheterTracker`` finds the tip, and what limits it."""
+    distance, reason = working_range(camera, catheter)
+    focal, shortest = _focal(camera), _shortest(catheter)
+    return (
+        f"Range      the bands may be up to about {distance:.2g} m from the camera (in full view, good light and full "
+        f"colours): there the shortest one, {1e3 * shortest:.3g} mm, is {focal * shortest / distance:.0f} px long and "
+        f"the tube {2 * focal * catheter.radius / distance:.1f} px wide; beyond, {reason}"
+    )
+
+
+def working_range(camera: Camera, catheter: Catheter) -> tuple[float, str]:
+    """The largest distance in metres from the camera to the bands of a catheter that faces it, and what limits it.
+
+    The bands must be some pixels long and wide, as the detection needs them, and their edges must determine the tip as
+    closely as the tracker demands. Noise, motion, and video with half the resolution of colours (4:2:0) shorten it.
+    """
+    focal, most = _focal(camera), MOST_SD
+    limits = [
+        (focal * 2 * catheter.radius / AxisLimits.narrowest, f"the tube is narrower than {AxisLimits.narrowest:g} px"),
+        (focal * _shortest(catheter) / _SHORTEST, f"the shortest band has less than {_SHORTEST:g} px"),
+        (_certain(camera, catheter, most), f"the tip is less certain than {1e3 * most:g} mm"),
+    ]
+    return min(limits)
+
+
+def _certain(camera: Camera, catheter: Catheter, most: float) -> float:
+    """Largest distance in metres up to which edges determine the tip to ``most`` metres."""
+    positions, matrix = catheter.positions, camera.matrix.detach().double()
+    z = torch.logspace(math.log10(_NEAREST), math.log10(_FARTHEST), _STEPS, dtype=torch.float64)
+    along = positions - (positions[0] + positions[-1]) / 2
+    x = matrix[0, 0] * along / z[:, None] + matrix[0, 2]
+    pinhole = Camera(matrix, torch.zeros(5, dtype=torch.float64))
+    edges = torch.stack([x, matrix[1, 2].expand_as(x)], -1)
+    pose = solve_pose(edges, positions, pinhole, along_px=_EDGE, across_px=_EDGE)
+    certain = pose.tip_sd <= most
+    return float(z[certain].max()) if bool(certain.any()) else _NEAREST
+
+
+def _focal(camera: Camera) -> float:
+    return float(camera.matrix.detach().diagonal()[:2].min())
+
+
+def _shortest(catheter: Catheter) -> float:
+    return min(b - a for a, b in pairwise(catheter.edges))

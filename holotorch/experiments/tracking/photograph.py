@@ -1,0 +1,126 @@
+"""``holotorch calibrate catheter``: the colours of a catheter's bands from a photograph of it."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking.devices import build_catheter, load_catheter, save_catheter
+from holotorch.io.bundled import find_config
+from holotorch.io.images import load_image, with_channels
+from holotorch.io.video import PICTURES, open_frames
+from holotorch.tracking import Camera, Catheter
+from holotorch.tracking.detection.channels import ambiguities, ambiguity_text
+from holotorch.tracking.detection.colours import ColourTable
+
+GEOMETRY = "configs/tracking/catheter.yaml"  # whose edges, radius and length are kept unless another file is named
+_AROUND = 2  # pixels to each side of a position that count too
+_UNEVEN = 25  # levels: deviation within a box above which it probably holds more than one band
+_BRIGHT = 250  # level from which on a channel is probably saturated
+_PLACE = re.compile(r"(\d{1,5}),(\d{1,5})(?:,(\d{1,5}),(\d{1,5}))?")
+
+
+def calibrate_catheter(
+    photograph: Path, places: Sequence[str], out: Path, geometry: Path | None = None
+) -> tuple[Catheter, list[str]]:
+    """Read the colours of the bands from a photograph and write the catheter to ``out``.
+
+    Args:
+        photograph: A picture, or a video or folder whose first frame is taken, in the light of the later frames.
+        places: One for each band, from the tip on: a position X,Y in pixels, or a box X0,Y0,X1,Y1 on the band.
+        out: YAML file for the catheter; must not exist yet.
+        geometry: YAML file whose edges, radius and length are kept; by default that of the dissertation's catheter.
+
+    Returns:
+        The catheter, and lines of text about its colours.
+
+    Raises:
+        ConfigError: A file cannot be used, a place is none or not on the picture, or the colours cannot be told apart.
+    """
+    if out.exists():
+        raise ConfigError([f"{out} exists already; choose another --out or delete it"])
+    source = geometry or Path(GEOMETRY)
+    tool = build_catheter(load_catheter(find_config(source) or source))
+    pixels = _pixels(photograph)
+    boxes = _boxes(places, len(tool.colours), pixels.shape[-2:])
+    levels, spread = zip(*(_colour(pixels, box) for box in boxes), strict=True)
+    camera = Camera(torch.eye(3, dtype=torch.float64), torch.zeros(5, dtype=torch.float64))  # of the tone sRGB
+    try:
+        catheter = replace(tool, colours=levels)
+        ColourTable(camera, catheter)
+    except ValueError as error:
+        listed = ", ".join(f"{place}: {list(level)}" for place, level in zip(places, levels, strict=True))
+        words = "photograph the bands in even light without gloss, or paint others"
+        raise ConfigError([f"{photograph}: {error}; found {listed}: {words}"]) from None
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_catheter(out, catheter)
+    lines = [
+        f"Band {i}     [{', '.join(map(str, level))}] at {place}, deviation {deviation:.0f} levels"
+        for i, (level, place, deviation) in enumerate(zip(levels, places, spread, strict=True), 1)
+    ]
+    edges = ", ".join(f"{1e3 * edge:g}" for edge in tool.edges)
+    lines.append(
+        f"Geometry   edges at {edges} mm from the tip, radius {1e3 * tool.radius:g} mm, of {source}: measure yours and "
+        "edit them"
+    )
+    notes = [
+        f"band {i} varies much within {place}: choose a smaller box that holds this band alone"
+        for i, (place, deviation) in enumerate(zip(places, spread, strict=True), 1)
+        if deviation > _UNEVEN
+    ]
+    notes += [
+        f"band {i} is overexposed: its hue is not known; use a shorter exposure"
+        for i, level in enumerate(levels, 1)
+        if max(level) >= _BRIGHT
+    ]
+    if doubt := ambiguity_text(ambiguities(camera, catheter)):
+        notes.append(doubt)
+    return catheter, [*lines, *(f"Note       {note}" for note in notes)]
+
+
+def _pixels(photograph: Path) -> torch.Tensor:
+    """RGB pixels uint8 [3, H, W] of a picture, or of the first frame of a video or folder."""
+    try:
+        if photograph.suffix.lower() in PICTURES:
+            return (with_channels(load_image(photograph), 3) * 255).round().to(torch.uint8)
+        with open_frames(photograph) as frames:
+            first = next(iter(frames))
+    except (ValueError, OSError) as error:
+        raise ConfigError([f"{photograph}: {getattr(error, 'strerror', None) or error}"]) from None
+    if first.pixels is None:
+        raise ConfigError([f"{photograph}: {first.problem}"])
+    return first.pixels
+
+
+def _boxes(places: Sequence[str], bands: int, size: Sequence[int]) -> list[tuple[int, int, int, int]]:
+    """Boxes (x0, y0, x1, y1), ends included, of the places. ConfigError with all mistakes."""
+    if len(places) != bands:
+        raise ConfigError([f"--bands: expected {bands} places, one for each band from the tip on, got {len(places)}"])
+    mistakes, boxes = [], []
+    for place in places:
+        if not (match := _PLACE.fullmatch(place)):
+            mistakes.append(f"--bands: expected X,Y or X0,Y0,X1,Y1 in pixels, got {place!r}")
+            continue
+        x, y = int(match[1]), int(match[2])
+        box = (x, y, int(match[3]), int(match[4])) if match[3] else (x, y, x, y)
+        if not (box[0] <= box[2] < size[1] and box[1] <= box[3] < size[0]):
+            wanted = f"places on the picture of {size[1]} x {size[0]} px, X0,Y0 before X1,Y1"
+            mistakes.append(f"--bands: expected {wanted}, got {place!r}")
+        if not match[3]:
+            box = (max(0, x - _AROUND), max(0, y - _AROUND), x + _AROUND, y + _AROUND)
+        boxes.append(box)
+    if mistakes:
+        raise ConfigError(mistakes)
+    return boxes
+
+
+def _colour(pixels: torch.Tensor, box: tuple[int, int, int, int]) -> tuple[tuple[int, int, int], float]:
+    """Median colour within a box, and the largest standard deviation of its channels, in levels."""
+    x0, y0, x1, y1 = box
+    inside = pixels[:, y0 : y1 + 1, x0 : x1 + 1].flatten(1).numpy().astype(np.float64)
+    red, green, blue = (int(value) for value in np.median(inside, 1).round())
+    return (red, green, blue), float(inside.std(1).max())

@@ -1,0 +1,158 @@
+"""The colours of a catheter from a photograph, and the forecast of how far away it can be found."""
+
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from holotorch.cli import main
+from holotorch.experiments.tracking.devices import build_catheter, load_catheter, save_camera, save_catheter
+from holotorch.experiments.tracking.forecast import range_text, working_range
+from holotorch.tracking import Catheter, CatheterTracker, ChannelOrder
+from holotorch.tracking.simulation.world import World, synthetic_camera
+
+EDGES = (0.070, 0.108, 0.146, 0.184)
+OTHER = Catheter(EDGES, ((225, 130, 30), (30, 160, 165), (150, 40, 160)), 1e-3, 0.35)  # orange, teal, purple
+SIZE = (540, 960)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def photograph(world: World) -> list[tuple[int, int]]:
+    """Write bands.png of a catheter, and return the pixels of the middles of its bands."""
+    tip, along = world.pose(0.4, 0.2)
+    frame = world.case("photograph", (tip, along)).frame()
+    cv2.imwrite("bands.png", np.ascontiguousarray(frame.movedim(0, -1).numpy()[..., ::-1]))
+    middles = (world.catheter.positions[:-1] + world.catheter.positions[1:]) / 2
+    return [(round(x), round(y)) for x, y in world.camera.project(tip + middles[:, None] * along).tolist()]
+
+
+def test_a_catheter_whose_colours_come_from_a_photograph_is_tracked(capsys):
+    world = World(size=SIZE, catheter=OTHER)
+    places = [f"{x},{y}" for x, y in photograph(world)]
+    assert main(["calibrate", "catheter", "bands.png", "--bands", *places]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("Band 1     [") and f"at {places[0]}" in lines[0] and lines[-1] == "catheter.yaml"
+    assert "edges at 70, 108, 146, 184 mm" in lines[3] and "measure yours" in lines[3]
+    tool = build_catheter(load_catheter("catheter.yaml"))
+    assert (tool.edges, tool.radius, tool.length) == (EDGES, 1e-3, 0.35)
+    tip, along = world.pose(0.45, -0.1, 1.0)
+    frame = world.case("later", (tip, along)).frame()[None]
+    pose = CatheterTracker(world.camera, tool, channels=ChannelOrder.RGB)(frame)[0]
+    assert pose.answered and (pose.tip - tip).norm() < 2e-3
+    ordinary = World(size=SIZE).catheter
+    assert not CatheterTracker(world.camera, ordinary, channels=ChannelOrder.RGB)(frame)[0].answered
+
+
+def test_a_box_counts_its_median_and_keeps_the_geometry_of_a_file(capsys):
+    picture = np.full((60, 90, 3), 128, np.uint8)
+    for i, colour in enumerate(((200, 30, 40), (40, 180, 60), (50, 60, 255))):  # the third is overexposed
+        picture[20:30, 30 * i : 30 * i + 20] = colour[::-1]
+    picture[20:24, 0:10] = 0  # less than half of the first box
+    cv2.imwrite("bands.png", picture)
+    save_catheter(Path("own.yaml"), Catheter((0.02, 0.04, 0.05, 0.06), OTHER.colours, 8e-4, 0.2))
+    words = ["--bands", "0,20,19,29", "40,25", "60,20,79,29", "--catheter", "own.yaml", "--out", "new/mine.yaml"]
+    assert main(["calibrate", "catheter", "bands.png", *words]) == 0
+    out = capsys.readouterr().out
+    tool = build_catheter(load_catheter("new/mine.yaml"))
+    assert tool.colours == ((200, 30, 40), (40, 180, 60), (50, 60, 255))
+    assert tool.edges == (0.02, 0.04, 0.05, 0.06) and tool.radius == 8e-4
+    assert "band 1 varies much within 0,20,19,29" in out and "band 2 varies" not in out
+    assert "band 3 is overexposed" in out and "band 1 is overexposed" not in out
+    assert main(["calibrate", "catheter", "bands.png", *words]) == 2
+    assert "new/mine.yaml exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["bands.png"], "expected one photograph and --bands X,Y X,Y X,Y"),
+        (["bands.png", "--bands", "1,1", "--axes", "RUB"], "without --board and --axes"),
+        (
+            ["bands.png", "--bands", "1,1", "2,2"],
+            "--bands: expected 3 places, one for each band from the tip on, got 2",
+        ),
+        (["bands.png", "--bands", "1,1", "red", "2,2"], "expected X,Y or X0,Y0,X1,Y1 in pixels, got 'red'"),
+        (
+            ["bands.png", "--bands", "1,1", "40,1", "2,2"],
+            "expected places on the picture of 40 x 30 px, X0,Y0 before X1,Y1, got '40,1'",
+        ),
+        (["bands.png", "--bands", "5,5", "9,9", "9,5"], "saturated colours"),
+        (["none.png", "--bands", "5,5", "9,9", "9,5"], "none.png: no such picture"),
+        (["none.mp4", "--bands", "5,5", "9,9", "9,5"], "none.mp4"),
+        (["bands.png", "--bands", "5,5", "9,9", "9,5", "--catheter", "no.yaml"], "no.yaml"),
+    ],
+)
+def test_what_cannot_be_used_is_said(words, message, capsys):
+    picture = np.full((30, 40, 3), 128, np.uint8)
+    picture[5, 5:10], picture[9, 9] = (120, 130, 190), (190, 120, 130)
+    cv2.imwrite("bands.png", cv2.resize(picture[5:6, 5:6], (40, 30)) if "saturated" not in message else grey())
+    assert main(["calibrate", "catheter", *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error and not Path("catheter.yaml").exists()
+
+
+def grey() -> np.ndarray:
+    """A picture of three slightly coloured greys, which differ enough to be neighbours."""
+    picture = np.full((30, 40, 3), 128, np.uint8)
+    picture[:7, :7], picture[7:], picture[:7, 7:] = (60, 60, 70), (130, 130, 140), (190, 200, 200)
+    return picture
+
+
+def test_options_of_a_catheter_belong_to_it(capsys):
+    assert main(["calibrate", "a.png", "--bands", "1,1"]) == 2
+    assert "--bands and --catheter belong to: calibrate catheter PHOTOGRAPH" in capsys.readouterr().err
+
+
+TOOLS = {
+    "thin": (0.038, 0.070, 0.6e-3, "the tube is narrower than 2.4 px"),
+    "short bands": (0.006, 0.070, 1e-3, "the tip is less certain than 2 mm"),
+    "far tip": (0.010, 0.200, 1e-3, "the tip is less certain than 2 mm"),
+    "bands at the tip": (0.010, 0.010, 1e-3, "the shortest band has less than 22 px"),
+}
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_the_forecast_distance_is_where_tracking_ends(name):
+    """Three frames nearer than the forecast are all answered, and three much farther are not all answered."""
+    band, first, radius, reason = TOOLS[name]
+    tool = Catheter(tuple(first + band * i for i in range(4)), World().catheter.colours, radius, 0.35)
+    world = World(catheter=tool)
+    distance, why = working_range(world.camera, tool)
+    assert why == reason
+    tracker = CatheterTracker(world.camera, tool, channels=ChannelOrder.RGB)
+
+    def answered(depth: float) -> int:
+        poses = [world.pose(depth, 0.0, 0.4 + 0.3 * k) for k in range(3)]
+        return sum(tracker(world.case(f"{k}", pose).frame()[None])[0].answered for k, pose in enumerate(poses))
+
+    assert answered(0.9 * distance) == 3
+    assert answered(1.5 * distance) < 3
+
+
+def test_the_plan_says_the_range_of_the_camera_and_catheter_that_are_given(capsys):
+    save_camera(Path("c.yaml"), synthetic_camera((540, 960)), (540, 960))
+    cv2.imwrite("0.png", np.zeros((540, 960, 3), np.uint8))
+    files = ["camera=c.yaml", "catheter=configs/tracking/catheter.yaml"]
+    for source in ("0.png", "synthetic"):
+        words = ["check", "configs/tracking/track.yaml", f"source={'.' if source == '0.png' else source}", *files]
+        with warnings.catch_warnings(action="ignore"):
+            assert main(words) == 0
+        (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Range")]
+        # 700 px of focal length, 2 mm, 2.4 px; there the bands of 38 mm have 46 px.
+        assert "up to about 0.58 m" in line and "38 mm, is 46 px long and the tube 2.4 px wide" in line
+        assert line.endswith("beyond, the tube is narrower than 2.4 px")
+
+
+def test_more_pixels_see_farther():
+    tool = World().catheter
+    near, far = (working_range(synthetic_camera(size), tool)[0] for size in ((540, 960), (1080, 1920)))
+    assert far == pytest.approx(2 * near, rel=1e-9)
+    assert range_text(synthetic_camera(), tool).startswith("Range      the bands may be up to about 1.2 m")
+    assert torch.isfinite(torch.tensor(far))
