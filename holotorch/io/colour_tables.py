@@ -109,8 +109,7 @@ def picture_matrix(wavelengths: Sequence[float]) -> Tensor:
 
     Equal intensities at three or more wavelengths are neutral grey, with powers as of :func:`white_balance`; those of
     more than three are as equal as they can be. Two wavelengths are shown in their own colours, each as bright as sRGB
-    allows and mixed with grey as by ``optics.gamut_map``. A single one is
-    shown in grey, whatever its colour.
+    allows and mixed with grey as by ``optics.gamut_map``. A single one is shown in grey, whatever its colour.
 
     Raises:
         ValueError: No wavelengths, or wavelengths that have no colour or cannot be mixed to white.
