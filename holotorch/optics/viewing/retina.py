@@ -73,10 +73,14 @@ def plan_retina(
 ) -> RetinaPlan:
     """Choose between :func:`propagate_collapsed` and :func:`propagate_elements`.
 
-    The errors are measured on lines of light (:mod:`holotorch.optics.viewing.line_errors`), by default lines of noise
-    that fills window and band of the hologram, as speckled light does. Light without speckle has a smaller error: 3 to
-    50 times smaller for photographs of constant phase and for points, and 100 times and more for smooth beams, which do
-    not reach the edge of the pupil. ``example`` gives the error for light of its kind.
+    The errors are those of lines of light (:mod:`holotorch.optics.viewing.line_errors`): by default of noise that fills
+    window and band of the hologram, in expectation, and of rows and columns of ``example`` if it is given. Errors with
+    an example are within a factor 3 of those in two dimensions for noise, pictures, holograms, points and beams
+    (tests/optics/viewing/test_line_errors.py). Without an example that holds for light that is speckled all over the
+    hologram. Smooth light errs less, since little of it reaches the edge of the pupil: photographs of constant phase 2
+    to 60 times and beams about 100 times or more; points lie anywhere between. Two exceptions: the error of a few
+    points by elements may be 4 times too large, and that of the collapse, if the eyepiece cuts light off, 6 times too
+    small.
 
     Args:
         grid: Sampling of the hologram.
@@ -106,28 +110,9 @@ def plan_retina(
     wavelengths = checks.wavelengths(wavelengths)
     limit_of_error = TOLERANCE if tolerance is None else checks.positive("tolerance", tolerance)
     plane = display.object_plane(plane, eye.accommodation)
-    samplings: list[imaging.CollapseSampling | ElementSampling] = []
-    impossible = ""
-    try:
-        samplings.append(imaging.collapse_sampling(grid, wavelengths, display, eye, plane))
-    except ValueError as error:
-        impossible = f"collapse is impossible here: {error}"
-    samplings.append(least_oversampling(grid, wavelengths, display, eye, plane=plane))
     lines = _lines(grid, wavelengths, number(plane), reach, example)
-    setup = grid, wavelengths, display, eye, number(plane)
-    errors = line_errors(lines, *setup, samplings, paraxial=paraxial or registered, dtype=dtype)
-    bands = max(math.prod(imaging.pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
-    options = []
-    for sampling, error in zip(samplings, errors, strict=True):
-        if isinstance(sampling, ElementSampling):
-            options.append(_option("elements", sampling, error, sampling.memory_bytes(dtype.itemsize), limit_of_error))
-            continue
-        if registered and not paraxial:
-            heights = _heights(grid, reach)
-            paths = (collapse_error(grid, w, display, eye, plane, heights, registered=True) for w in wavelengths)
-            error = math.hypot(error, max(paths))
-        memory = sampling.memory_bytes(bands * math.prod(sampling.window), dtype.itemsize)
-        options.append(_option("collapse", sampling, error, memory, limit_of_error))
+    setup = grid, wavelengths, display, eye, plane
+    options, impossible = _options(lines, *setup, reach, paraxial, registered, dtype, limit_of_error)
     best, cheapest = _choice(options, tolerance, math.inf if memory_limit is None else memory_limit)
     reason = (
         f"{best.method} at {max(best.sampling.oversampling):.2f} times the hologram's sampling: error "
@@ -136,6 +121,44 @@ def plan_retina(
     )
     runner_up = next((each.reason for each in options if each is not best), impossible)
     return replace(best, reason=reason, runner_up=runner_up, cost_ratio=best.flops / cheapest.flops)
+
+
+def _options(
+    lines: list[Lines],
+    grid: Grid,
+    wavelengths: Sequence[float],
+    display: Display,
+    eye: Eye,
+    plane: Length,
+    reach: float | None,
+    paraxial: bool,
+    registered: bool,
+    dtype: torch.dtype,
+    tolerance: float,
+) -> tuple[list[RetinaPlan], str]:
+    """Plans for all methods that are possible, and why the collapse is not, or an empty text."""
+    samplings: list[imaging.CollapseSampling | ElementSampling] = []
+    impossible = ""
+    try:
+        samplings.append(imaging.collapse_sampling(grid, wavelengths, display, eye, plane))
+    except ValueError as error:
+        impossible = f"collapse is impossible here: {error}"
+    samplings.append(least_oversampling(grid, wavelengths, display, eye, plane=plane))
+    setup = grid, wavelengths, display, eye, number(plane)
+    errors = line_errors(lines, *setup, samplings, paraxial=paraxial or registered, dtype=dtype)
+    options = []
+    for sampling, error in zip(samplings, errors, strict=True):
+        if isinstance(sampling, ElementSampling):
+            options.append(_option("elements", sampling, error, sampling.memory_bytes(dtype.itemsize), tolerance))
+            continue
+        if registered and not paraxial:
+            heights = _heights(grid, reach)
+            paths = (collapse_error(grid, w, display, eye, plane, heights, registered=True) for w in wavelengths)
+            error = math.hypot(error, max(paths))
+        bands = max(math.prod(imaging.pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
+        memory = sampling.memory_bytes(bands * math.prod(sampling.window), dtype.itemsize)
+        options.append(_option("collapse", sampling, error, memory, tolerance))
+    return options, impossible
 
 
 def _lines(
