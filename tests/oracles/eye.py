@@ -45,3 +45,27 @@ def transfer(frequency, wavelength, distance, paraxial):
     travels = s2 < 1
     cosine = np.sqrt(np.where(travels, 1 - s2, 0))
     return np.where(travels, np.exp(-2j * np.pi / wavelength * distance * s2 / (1 + cosine)), 0)
+
+
+def retina_by_quadrature(holograms, pitch, wavelength, focal_length, eye, step, nodes=160):
+    """Paraxial fields [S, H, W] on the retina of holograms [S, H, W], by Gauss's quadrature over the disc of the pupil.
+
+    A lens at the hologram focuses into the pupil, so that each sample, a sinc, lights a square of the pupil evenly.
+    ``eye`` is (1 / accommodation, r_eye, d_r), and ``step`` the distance of the samples on the retina. Nothing wraps
+    around, and the edge of the pupil lies where it is.
+    """
+    vergence, radius, d_r = eye
+    t, weight = np.polynomial.legendre.leggauss(nodes)
+    end = min(radius, wavelength * focal_length / (2 * pitch))
+    angle = np.arcsin(end / radius)
+    eta, d_eta = radius * np.sin(angle * t), radius * angle * np.cos(angle * t) * weight
+    half = np.minimum(np.sqrt(radius**2 - eta**2), end)
+    xi = half[:, None] * t  # [rows of the pupil, nodes of a row]
+    rows, columns = (np.arange(n) - n // 2 for n in holograms.shape[-2:])
+    there, back = -2j * np.pi / (wavelength * focal_length) * pitch, -2j * np.pi / (wavelength * d_r) * step
+    light = pitch**2 * np.exp(there * np.outer(eta, rows)) @ holograms
+    pupil = np.einsum("rnw,srw->srn", np.exp(there * xi[..., None] * columns), light)
+    defocus = np.exp(1j * np.pi / wavelength * (1 / focal_length - vergence) * (eta[:, None] ** 2 + xi**2))
+    pupil = pupil * defocus * weight * half[:, None] * d_eta[:, None]
+    lines = np.einsum("srn,rnw->srw", pupil, np.exp(back * xi[..., None] * columns))
+    return np.exp(back * np.outer(rows, eta)) @ lines / (wavelength * focal_length * wavelength * d_r)

@@ -94,7 +94,7 @@ def _methods(observer: Observer) -> list[dict]:
         return propagate_elements(field, grid, [wavelength], display, eye, sampling=_scaled(least, factor), **setup)
 
     reference = intensity(by_elements(1.3))
-    plan = plan_retina(grid, [wavelength], display, eye, **setup)
+    plan = plan_retina(grid, [wavelength], display, eye, example=field, **setup)
     needed = max(least.oversampling)
     calls: dict[str, Any] = {COLLAPSE: partial(propagate_collapsed, field, grid, [wavelength], display, eye, **setup)}
     for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):

@@ -108,8 +108,8 @@ def propagate_collapsed(
     """Field on the retina, referred back to the object plane: the g(x) of this module's derivation.
 
     It neglects the edge of the eyepiece, the non-Fresnel phase behind the eyepiece for points beside the axis, and
-    light that leaves the window of ``grid`` before the object plane. The error that ``plan_retina`` predicts includes
-    the first two. Thesis Algorithm 6 instead samples every lens phase at the hologram's pitch, where it aliases.
+    light that leaves the window of ``grid`` before the object plane. ``plan_retina`` predicts the error, which includes
+    that of the sampling. Thesis Algorithm 6 instead samples every lens phase at the hologram's pitch, where it aliases.
 
     Args:
         field: Field of the hologram, complex [..., C, H, W].

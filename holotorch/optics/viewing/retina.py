@@ -19,11 +19,8 @@ from holotorch.optics.viewing import imaging
 from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
 from holotorch.optics.viewing.eye import Eye
+from holotorch.optics.viewing.line_errors import Lines, field_lines, line_errors, noise_lines, scene_lines
 
-# Relative error of sampling the hard edge of a pupil, times the number of samples across its diameter. Measured for the
-# collapse: 1.1 to 3.2 for points (1360 samples) and 0.6 to 3.4 for noise (42 to 55 samples); measured for
-# element-by-element propagation: 0.4 to 1.3 (3800 samples).
-_EDGE_ERROR = 3.0
 _RAYS = 512  # rays across the pupil from each point of the scene that predict the error of the collapse
 _HEIGHTS = 9  # points of the scene that predict the error of the collapse
 _UNUSABLE = 0.5  # expected relative error above which a plan is refused
@@ -38,7 +35,8 @@ class RetinaPlan:
     Attributes:
         method: "collapse" (:func:`propagate_collapsed`) or "elements" (:func:`propagate_elements`).
         sampling: Sizes for that method.
-        predicted_error: Expected relative L2 error of the intensity, over points of light within the scene.
+        predicted_error: Expected relative L2 error of the intensity of all channels; :func:`plan_retina` says for which
+            light.
         memory_bytes: Largest extra memory in bytes for one image of one wavelength.
         flops: Floating-point operations for one image of one wavelength.
         reason: Error and cost of the chosen method, in words.
@@ -69,10 +67,20 @@ def plan_retina(
     reach: float | None = None,
     paraxial: bool = False,
     registered: bool = False,
+    example: Tensor | None = None,
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> RetinaPlan:
     """Choose between :func:`propagate_collapsed` and :func:`propagate_elements`.
+
+    The errors are those of lines of light (:mod:`holotorch.optics.viewing.line_errors`): by default of noise that fills
+    window and band of the hologram, in expectation, and of rows and columns of ``example`` if it is given. Errors with
+    an example are within a factor 3 of those in two dimensions for noise, pictures, holograms, points and beams
+    (tests/optics/viewing/test_line_errors.py). Without an example that holds for light that is speckled all over the
+    hologram. Smooth light errs less, since little of it reaches the edge of the pupil: photographs of constant phase 2
+    to 60 times and beams about 100 times or more; points lie anywhere between. Two exceptions: the error of a few
+    points by elements may be 4 times too large, and that of the collapse, if the eyepiece cuts light off, 6 times too
+    small.
 
     Args:
         grid: Sampling of the hologram.
@@ -82,10 +90,13 @@ def plan_retina(
         tolerance: Largest accepted relative L2 error of the intensity. By default the cheapest method is taken, which
             is called adequate if its error is at most 0.1.
         plane: Distance in metres from the hologram to the object plane; by default that of the plane in focus.
-        reach: Half width in metres of the scene in the object plane; by default that of the hologram.
+        reach: Half width in metres of a scene of noise in the object plane, whose hologram takes the place of noise in
+            the plane of the hologram.
         paraxial: Predict errors in the Fresnel model, in which the eyepiece's edge and the sampling are the only errors
             of the collapse.
-        registered: Leave out errors that only move parts of the image by a fraction of a spot.
+        registered: Do not count as an error that parts of the image move by a fraction of a spot. The error of oblique
+            paths is then that of points within ``reach``, by default within the hologram (:func:`collapse_error`).
+        example: A field [..., C, H, W] like those to be propagated, which takes the place of noise.
         dtype: Type of the field, complex64 or complex128.
         memory_limit: Exclude a method that needs more bytes than this for one image of one wavelength.
 
@@ -99,26 +110,9 @@ def plan_retina(
     wavelengths = checks.wavelengths(wavelengths)
     limit_of_error = TOLERANCE if tolerance is None else checks.positive("tolerance", tolerance)
     plane = display.object_plane(plane, eye.accommodation)
-    heights = _heights(grid, reach)
-    diameter = 2 * number(eye.pupil_radius)
-    options, impossible = [], ""
-    try:
-        collapse = imaging.collapse_sampling(grid, wavelengths, display, eye, plane)
-        errors = [
-            collapse_error(grid, w, display, eye, plane, heights, paraxial=paraxial, registered=registered)
-            for w in wavelengths
-        ]
-        spot = max(wavelengths) * (abs(number(display.matrix(plane)[1])) / diameter)
-        edge = _EDGE_ERROR * max(spot / (n * p) for n, p in zip(collapse.window, grid.pitch, strict=True) if n > 1)
-        bands = max(math.prod(imaging.pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
-        memory = collapse.memory_bytes(bands * math.prod(collapse.window), dtype.itemsize)
-        options.append(_option("collapse", collapse, math.hypot(max(errors), edge), memory, limit_of_error))
-    except ValueError as error:
-        impossible = f"collapse is impossible here: {error}"
-    elements = least_oversampling(grid, wavelengths, display, eye, plane=plane)
-    step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, elements.oversampling, strict=True) if n > 1)
-    edge = min(1.0, _EDGE_ERROR * step / diameter)
-    options.append(_option("elements", elements, edge, elements.memory_bytes(dtype.itemsize), limit_of_error))
+    lines = _lines(grid, wavelengths, number(plane), reach, example)
+    setup = grid, wavelengths, display, eye, plane
+    options, impossible = _options(lines, *setup, reach, paraxial, registered, dtype, limit_of_error)
     best, cheapest = _choice(options, tolerance, math.inf if memory_limit is None else memory_limit)
     reason = (
         f"{best.method} at {max(best.sampling.oversampling):.2f} times the hologram's sampling: error "
@@ -127,6 +121,57 @@ def plan_retina(
     )
     runner_up = next((each.reason for each in options if each is not best), impossible)
     return replace(best, reason=reason, runner_up=runner_up, cost_ratio=best.flops / cheapest.flops)
+
+
+def _options(
+    lines: list[Lines],
+    grid: Grid,
+    wavelengths: Sequence[float],
+    display: Display,
+    eye: Eye,
+    plane: Length,
+    reach: float | None,
+    paraxial: bool,
+    registered: bool,
+    dtype: torch.dtype,
+    tolerance: float,
+) -> tuple[list[RetinaPlan], str]:
+    """Plans for all methods that are possible, and why the collapse is not, or an empty text."""
+    samplings: list[imaging.CollapseSampling | ElementSampling] = []
+    impossible = ""
+    try:
+        samplings.append(imaging.collapse_sampling(grid, wavelengths, display, eye, plane))
+    except ValueError as error:
+        impossible = f"collapse is impossible here: {error}"
+    samplings.append(least_oversampling(grid, wavelengths, display, eye, plane=plane))
+    setup = grid, wavelengths, display, eye, number(plane)
+    errors = line_errors(lines, *setup, samplings, paraxial=paraxial or registered, dtype=dtype)
+    options = []
+    for sampling, error in zip(samplings, errors, strict=True):
+        if isinstance(sampling, ElementSampling):
+            options.append(_option("elements", sampling, error, sampling.memory_bytes(dtype.itemsize), tolerance))
+            continue
+        if registered and not paraxial:
+            heights = _heights(grid, reach)
+            paths = (collapse_error(grid, w, display, eye, plane, heights, registered=True) for w in wavelengths)
+            error = math.hypot(error, max(paths))
+        bands = max(math.prod(imaging.pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
+        memory = sampling.memory_bytes(bands * math.prod(sampling.window), dtype.itemsize)
+        options.append(_option("collapse", sampling, error, memory, tolerance))
+    return options, impossible
+
+
+def _lines(
+    grid: Grid, wavelengths: Sequence[float], plane: float, reach: float | None, example: Tensor | None
+) -> list[Lines]:
+    """Lines of light of each wavelength on which :func:`plan_retina` measures errors."""
+    if example is not None:
+        checks.field("example", example, (len(wavelengths), *grid.shape))
+        return [field_lines(light) for light in example.unbind(-3)]
+    if reach is None:
+        return [noise_lines(grid)] * len(wavelengths)
+    half_width = checks.quantity(WIDTH, reach, "reach")
+    return [scene_lines(grid, each, plane, half_width) for each in wavelengths]
 
 
 def _choice(options: list[RetinaPlan], tolerance: float | None, limit: float) -> tuple[RetinaPlan, RetinaPlan]:
@@ -241,7 +286,7 @@ class Retina(PreciseModule):
         grid, wavelengths, display, eye, plane, paraxial: As in :func:`propagate_collapsed`.
         tolerance: Largest accepted relative L2 error of the intensity. By default the cheapest method, which a training
             loop can afford; if its expected error exceeds 0.1, a warning states the cost of a better one.
-        options: ``reach``, ``registered``, ``dtype`` and ``memory_limit`` of :func:`plan_retina`.
+        options: ``reach``, ``registered``, ``example``, ``dtype`` and ``memory_limit`` of :func:`plan_retina`.
 
     Attributes:
         plan: The chosen method and the reason for it.
