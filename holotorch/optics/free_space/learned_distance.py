@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.special import FRESNEL_BORDER, fresnel_auxiliary, fresnel_integral
 from holotorch.optics.free_space.kernels import turns_phasor
@@ -33,7 +34,7 @@ def has_closed_form(planes: PlanePair, wavelength: Tensor, distance: Tensor) -> 
     """
     if not (distance.requires_grad and torch.is_grad_enabled()) or wavelength.requires_grad or distance.numel() != 1:
         return False
-    if torch.compiler.is_compiling() or distance.device.type != "cpu" or not planes.straight:
+    if not checks.readable(distance) or not planes.straight:
         return False
     if torch._C._are_functorch_transforms_active() or forward_ad.unpack_dual(distance).tangent is not None:
         return False
