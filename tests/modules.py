@@ -43,7 +43,6 @@ OTHER = Grid((9, 8), (3e-6, 7e-6))
 DEPTHS = (0.21e-3, 0.26e-3)
 RETINAL = Grid((12, 12), 8e-6)
 CONTRACTS = ("second derivatives", "forward mode", "vmap", "copies", "meta", "autocast", "compile", "export")
-BY_RAY = "rays end and empty space is skipped, which depends on the values"
 BY_LENGTH = "the sizes of the arrays follow from the lengths that are learned; with fixed lengths it does"
 
 
@@ -328,6 +327,5 @@ EXAMPLES = [
         lambda: (noise(4, 5, 6),),
         learned={"sampler.transfer.colours": 0.05, "sampler.transfer.opacities": 0.05},
         batched=False,
-        without={name: BY_RAY for name in ("meta", "compile", "export")},
     ),
 ]

@@ -77,12 +77,20 @@ def quantity(kind: Quantity, value: float | Tensor, name: str = "") -> float:
 def readable(*tensors: Tensor) -> bool:
     """Whether the elements of ``tensors`` can be read at no cost, so that it pays to ask for them and to do less.
 
-    Reading from a GPU waits for all that it has been told to do. Under ``torch.compile`` and ``torch.export``, on the
-    meta device, and in fake tensors and other subclasses, there are no values to be read.
+    They must have values, see :func:`have_values`, on the CPU: reading from a GPU waits for all that it has to do.
+    """
+    return have_values(*tensors) and all(each.device.type == "cpu" for each in tensors)
+
+
+def have_values(*tensors: Tensor) -> bool:
+    """Whether the elements of ``tensors`` can be read at all.
+
+    There are none under ``torch.compile`` and ``torch.export``, on the meta device, and in fake tensors and other
+    subclasses.
     """
     if torch.compiler.is_compiling():
         return False
-    return all(each.device.type == "cpu" and type(each) in (Tensor, nn.Parameter) for each in tensors)
+    return all(type(each) in (Tensor, nn.Parameter) and not each.is_meta for each in tensors)
 
 
 def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
