@@ -3,6 +3,10 @@
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+aten = torch.ops.aten
+WAITS = (aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default, aten.equal.default)
+INDEXES = (aten.index.Tensor, aten.index_put.default, aten.index_put_.default)  # wait if an index is a mask
+
 
 class HostReads(TorchDispatchMode):
     """Counts the operations that wait for a number to come back from the device."""
@@ -12,5 +16,6 @@ class HostReads(TorchDispatchMode):
         self.count = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += func in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten.nonzero.default)
+        masked = func in INDEXES and any(each is not None and each.dtype == torch.bool for each in args[1])
+        self.count += func in WAITS or masked
         return func(*args, **(kwargs or {}))

@@ -43,10 +43,7 @@ OTHER = Grid((9, 8), (3e-6, 7e-6))
 DEPTHS = (0.21e-3, 0.26e-3)
 RETINAL = Grid((12, 12), 8e-6)
 CONTRACTS = ("second derivatives", "forward mode", "vmap", "copies", "meta", "autocast", "compile", "export")
-BY_VALUE = "rows and planes without light are skipped, which depends on the values"
-BY_RAY = "rays end and empty space is skipped, which depends on the values"
 BY_LENGTH = "the sizes of the arrays follow from the lengths that are learned; with fixed lengths it does"
-BY_NUMPY = "the weights of the nodes are computed by NumPy"
 
 
 @dataclass(frozen=True)
@@ -309,18 +306,13 @@ EXAMPLES = [
         lambda: (*phases(), 2 * noise(len(WAVELENGTHS), *GRID.shape, seed=7)),
         learned={"crosstalk.sigma": 0.1, "propagator.distance": 1e-8},
     ),
-    Example(
-        "DirectHologram",
-        lambda: DirectHologram(GRID, 630e-9, DEPTHS),
-        layers,
-        without={name: BY_VALUE for name in ("meta", "compile", "export")},
-    ),
+    Example("DirectHologram", lambda: DirectHologram(GRID, 630e-9, DEPTHS), layers),
     Example("ConvolutionHologram", lambda: ConvolutionHologram(GRID, 630e-9, DEPTHS), layers),
+    Example("AxialHologram", lambda: AxialHologram(GRID, 630e-9, DEPTHS), layers),
     Example(
-        "AxialHologram",
-        lambda: AxialHologram(GRID, 630e-9, DEPTHS),
-        layers,
-        without={"compile": BY_NUMPY, "export": BY_NUMPY},
+        "AxialHologram, uneven depths",
+        lambda: AxialHologram(GRID, 630e-9, (*DEPTHS, 0.27e-3)),
+        lambda: (light(3, *GRID.shape),),
     ),
     Example(
         "TransferFunction",
@@ -335,6 +327,5 @@ EXAMPLES = [
         lambda: (noise(4, 5, 6),),
         learned={"sampler.transfer.colours": 0.05, "sampler.transfer.opacities": 0.05},
         batched=False,
-        without={name: BY_RAY for name in ("meta", "compile", "export")},
     ),
 ]

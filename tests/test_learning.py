@@ -1,10 +1,13 @@
 """Nothing loses its gradient in silence, and what is learned is found by training, in one process and in two."""
 
 import math
+import re
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
+from paths import ROOT
 from torch import Tensor, nn
 from two_processes import run_in_two_processes
 
@@ -25,7 +28,8 @@ from holotorch.optics import (
     Retina,
     SpectralFilter,
 )
-from holotorch.scene import TransferFunction
+from holotorch.optics.light.spectral import spectral_image
+from holotorch.scene import TransferFunction, Volume
 
 GRID, WAVELENGTH = Grid((12, 14), 8e-6), 530e-9
 DEPTHS = (0.3e-3, 0.4e-3)
@@ -175,3 +179,37 @@ def test_two_processes_train_as_one(tmp_path):
     for name, value in together.items():
         torch.testing.assert_close(value, model.state_dict()[name], rtol=1e-12, atol=0)
         assert not torch.equal(value, start[name]) and math.isfinite(value.sum())
+
+
+@pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")
+def test_the_examples_of_the_guide_run():
+    """Among them a module whose Parameter are the values of a volume, here given to an optimiser."""
+    text = (ROOT / "scripts" / "docs" / "learning.md").read_text()
+    names: dict[str, Any] = {}
+    exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.S)), names)
+    learned, sampler = names["learned"], names["learned"].sampler
+    assert learned.values.grad.norm() > 0 and "values" in learned.state_dict()
+    with torch.no_grad():
+        true = Volume(torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(1)), (1.0, 1.0, 1.0), "relative")
+        wanted = sampler.render(true)[0]
+    optimiser, losses = torch.optim.Adam([learned.values], lr=0.05), []
+    for _ in range(40):
+        optimiser.zero_grad()
+        loss = (learned() - wanted).square().mean()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.2 * losses[0]
+
+
+@pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")
+def test_the_width_of_a_source_has_a_gradient_through_its_weights():
+    wavelengths = torch.tensor([526e-9, 530e-9, 534e-9], dtype=torch.float64)
+    field = torch.polar(torch.ones(12, 14), 6 * torch.rand(12, 14)).to(torch.complex128)
+    eye = Eye(pupil_radius=1.2e-3, accommodation=0.25)
+
+    def image(width_nm: Tensor) -> Tensor:
+        power = 1 / (1 + ((wavelengths - 530e-9) / (width_nm * 0.5e-9)).square())
+        return spectral_image(field, GRID, wavelengths, power / power.sum(), Display.planar(0.2), eye, count=1)
+
+    assert torch.autograd.gradcheck(image, torch.tensor(5.0, dtype=torch.float64, requires_grad=True))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from holotorch.core import memory
 from holotorch.core.quantities import OFFSET, WAVELENGTH, Quantity
@@ -74,15 +74,34 @@ def quantity(kind: Quantity, value: float | Tensor, name: str = "") -> float:
     return number
 
 
+def readable(*tensors: Tensor) -> bool:
+    """Whether the elements of ``tensors`` can be read at no cost, so that it pays to ask for them and to do less.
+
+    They must have values, see :func:`have_values`, on the CPU: reading from a GPU waits for all that it has to do.
+    """
+    return have_values(*tensors) and all(each.device.type == "cpu" for each in tensors)
+
+
+def have_values(*tensors: Tensor) -> bool:
+    """Whether the elements of ``tensors`` can be read at all.
+
+    There are none under ``torch.compile`` and ``torch.export``, on the meta device, and in fake tensors and other
+    subclasses.
+    """
+    if torch.compiler.is_compiling():
+        return False
+    return all(type(each) in (Tensor, nn.Parameter) and not each.is_meta for each in tensors)
+
+
 def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
     """Check a number as :func:`quantity` does, and a tensor, which may require gradients, as :func:`quantities` does.
 
-    Tensors under ``compile`` and ``vmap``, which have no values yet, and tensors on a GPU are not checked.
+    Tensors that are not :func:`readable`, and those under ``vmap``, which have no values, are not checked.
     """
     if not isinstance(value, Tensor):
         quantity(kind, value, name)
-    elif value.device.type == "cpu" and not torch.compiler.is_compiling():
-        with contextlib.suppress(RuntimeError):  # vmapped and fake tensors have no values
+    elif readable(value):
+        with contextlib.suppress(RuntimeError):  # vmapped tensors have no values
             quantities(kind, value, name)
 
 
@@ -91,7 +110,7 @@ def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
     given = {"wavelength": wavelength, "distance": distance}
     tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
     coarse = {name: t.dtype for name, t in tensors.items() if t.is_floating_point() and t.dtype != torch.float64}
-    if not coarse or torch.compiler.is_compiling() or any(t.device.type != "cpu" for t in tensors.values()):
+    if not coarse or not readable(*tensors.values()):
         return
     rounding = sum(torch.finfo(dtype).eps / 2 for dtype in coarse.values())
     with contextlib.suppress(RuntimeError):

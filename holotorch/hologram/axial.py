@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,6 +30,8 @@ class AxialDesign:
 
     axes: tuple[Axis, Axis]  # sources and pixels along (y, x)
     nodes: Nodes  # nodes along the optical axis
+    begins: tuple[int, ...]  # index of the first node that each plane contributes to
+    weights: tuple[tuple[complex, ...], ...]  # weights of each plane on its nodes, from that one on
     raster: Raster  # padded array that holds the sources and the pixels
     predicted_error: float  # expected relative L2 error of the field of random sources
     adequate: bool  # whether ``predicted_error`` is within the tolerance
@@ -123,40 +124,37 @@ class AxialHologram(LayerHologram):
 
     def design(self, shape: tuple[int, int]) -> AxialDesign:
         """Nodes, transform sizes and predicted error for layers of ``shape`` (h, w); computed once per shape."""
-        if shape not in self._designs:
-            common = self.wavelength, min(self.depths), max(self.depths), self.cone
-            axes = y, x = [
-                Axis((count - 1) * self.stride + 1, pixels, self.stride, pitch, *common)
-                for count, pixels, pitch in zip(shape, self.grid.shape, self.grid.pitch, strict=True)
-            ]
-            if self.cone == "full" and not all(axis.within_band for axis in axes):
-                least = max(axis.displacement * axis.pitch / axis.steepest for axis in axes)
-                raise ValueError(
-                    "cone='full' leaves out no light only where every pixel lies within every source's cone, from "
-                    f"{least:.3g} m on for layers of {shape}; "
-                    f"the nearest depth is {min(self.depths):.3g} m: use cone='taper' or ConvolutionHologram"
-                )
-            # The error of each axis may be 0.4 of the tolerance, that of the nodes 0.3. They add in quadrature.
-            (height, error_y), (width, error_x) = (choose_length(axis, 0.4 * self.tolerance) for axis in axes)
-            steepest = min(y.steepest, y.fade(height)[1]), min(x.steepest, x.fade(width)[1])
-            low, high = axial_range(self.wavelength, steepest)
-            nodes = choose_nodes(self.depths, low, high, 0.3 * self.tolerance)
-            error = math.hypot(error_y, error_x, nodes.error(low, high))
-            raster = Raster(self.grid, shape, self.stride, (height, width))
-            self._designs[shape] = AxialDesign((y, x), nodes, raster, error, error <= self.tolerance)
+        _keep_design(self, shape)
         return self._designs[shape]
 
     def checked_design(self, shape: tuple[int, int]) -> AxialDesign:
         """The design for layers of ``shape`` (h, w); warns if its predicted error exceeds the tolerance."""
-        design = self.design(shape)
-        if not design.adequate:
-            warnings.warn(
-                f"the hologram's relative error is about {design.predicted_error:.1e}, and its tolerance "
-                f"{self.tolerance:.1e}: use ConvolutionHologram, cone='taper' or a larger tolerance",
-                checks.SamplingWarning,
-                stacklevel=2,
+        _keep_design(self, shape, warn=True)
+        return self._designs[shape]
+
+    def _choose_design(self, shape: tuple[int, int]) -> AxialDesign:
+        common = self.wavelength, min(self.depths), max(self.depths), self.cone
+        axes = y, x = [
+            Axis((count - 1) * self.stride + 1, pixels, self.stride, pitch, *common)
+            for count, pixels, pitch in zip(shape, self.grid.shape, self.grid.pitch, strict=True)
+        ]
+        if self.cone == "full" and not all(axis.within_band for axis in axes):
+            least = max(axis.displacement * axis.pitch / axis.steepest for axis in axes)
+            raise ValueError(
+                "cone='full' leaves out no light only where every pixel lies within every source's cone, from "
+                f"{least:.3g} m on for layers of {shape}; "
+                f"the nearest depth is {min(self.depths):.3g} m: use cone='taper' or ConvolutionHologram"
             )
-        return design
+        # The error of each axis may be 0.4 of the tolerance, that of the nodes 0.3. They add in quadrature.
+        (height, error_y), (width, error_x) = (choose_length(axis, 0.4 * self.tolerance) for axis in axes)
+        steepest = min(y.steepest, y.fade(height)[1]), min(x.steepest, x.fade(width)[1])
+        low, high = axial_range(self.wavelength, steepest)
+        nodes = choose_nodes(self.depths, low, high, 0.3 * self.tolerance)
+        error = math.hypot(error_y, error_x, nodes.error(low, high))
+        raster = Raster(self.grid, shape, self.stride, (height, width))
+        begins, weights = nodes.weights(self.depths)
+        spread = tuple(begins), tuple(map(tuple, weights.tolist()))
+        return AxialDesign((y, x), nodes, *spread, raster, error, error <= self.tolerance)
 
     def accumulate(self, planes: Iterable[Tensor], phase: Tensor | None = None) -> Tensor:
         """Field [H, W] of planes [h, w], real or complex, given in the order of ``depths``.
@@ -190,7 +188,7 @@ class AxialHologram(LayerHologram):
         design = self.checked_design(shape)
         nodes, raster = design.nodes, design.raster
         out = field.new_zeros(len(field), len(self.depths), *shape)
-        begins, weights = nodes.weights(self.depths)
+        begins, weights = design.begins, design.weights
         back = design.step(-1, field)
         for item, layers in zip(field, out, strict=True):
             spectrum = multiply_even(raster.spectrum_of_pixels(item), design.last(0, field).conj())
@@ -198,9 +196,24 @@ class AxialHologram(LayerHologram):
                 planes = [j for j, begin in enumerate(begins) if begin <= m < begin + nodes.width]
                 layer = raster.layer(spectrum) if planes else spectrum
                 for j in planes:
-                    layers[j] += layer * complex(weights[j, m - begins[j]].conj())
+                    layers[j] += layer * weights[j][m - begins[j]].conjugate()
                 spectrum *= back
         return out
+
+
+@torch.compiler.assume_constant_result
+def _keep_design(operator: AxialHologram, shape: tuple[int, int], *, warn: bool = False) -> None:
+    """Have the design for ``shape`` in ``operator``; computed when torch.compile traces, which cannot follow NumPy."""
+    if shape not in operator._designs:
+        operator._designs[shape] = operator._choose_design(shape)
+    design = operator._designs[shape]
+    if warn and not design.adequate:
+        warnings.warn(
+            f"the hologram's relative error is about {design.predicted_error:.1e}, and its tolerance "
+            f"{operator.tolerance:.1e}: use ConvolutionHologram, cone='taper' or a larger tolerance",
+            checks.SamplingWarning,
+            stacklevel=3,
+        )
 
 
 class Accumulator:
@@ -215,7 +228,7 @@ class Accumulator:
         self.operator, self.design = operator, operator.checked_design(shape)
         self.phasor = None if phase is None else phasor(phase)
         self.nodes = self.design.nodes
-        self.begins, self.weights = self.nodes.weights(operator.depths)
+        self.begins, self.weights = self.design.begins, self.design.weights
         # A plane contributes to ``width`` nodes. Additional rows allow groups of planes that are far apart.
         spare = round(_GROUP / 2 * self.nodes.count / len(operator.depths))
         self.rows = self.nodes.width + min(spare, self.nodes.width)
@@ -243,7 +256,7 @@ class Accumulator:
         if not has_light(plane):
             return
         if self.nodes.width == 1:
-            self._add_node(self.begins[j], plane * complex(self.weights[j, 0]))
+            self._add_node(self.begins[j], plane * self.weights[j][0])
             return
         if self.pending:
             first, first_plane = self.pending[0]
@@ -269,14 +282,15 @@ class Accumulator:
             return
         order, planes = [j for j, _ in self.pending], _stacked([plane for _, plane in self.pending])
         self.pending = []
-        begins = np.asarray([self.begins[j] for j in order])
-        touched = {*range(begins.min(), begins.max() + self.nodes.width)}
+        begins = [self.begins[j] for j in order]
+        touched = {*range(min(begins), max(begins) + self.nodes.width)}
         self._close(self.open - touched)
         self.open |= touched
-        matrix = np.zeros((self.rows, len(order)), np.complex128)
-        rows = (begins + np.arange(self.nodes.width)[:, None]) % self.rows
-        matrix[rows, np.arange(len(order))] = self.weights[order].T
-        spread = torch.from_numpy(matrix)
+        matrix = [[0j] * len(order) for _ in range(self.rows)]
+        for column, (j, begin) in enumerate(zip(order, begins, strict=True)):
+            for k, weight in enumerate(self.weights[j]):
+                matrix[(begin + k) % self.rows][column] = weight
+        spread = torch.tensor(matrix, dtype=torch.complex128)
         height, _, width = planes.shape
         if self.block is None:
             count = self.rows if planes.is_complex() else 2 * self.rows
@@ -322,6 +336,8 @@ class Accumulator:
 def _stacked(planes: list[Tensor]) -> Tensor:
     """J planes [h, w] as one tensor [h, J, w]; a view if the planes follow one another in memory."""
     first = planes[0]
+    if not checks.readable(*planes):  # nor have they addresses
+        return torch.stack(planes, 1)
     begin, memory = first.data_ptr(), first.untyped_storage().data_ptr()
     for k, plane in enumerate(planes):
         adjacent = plane.untyped_storage().data_ptr() == memory and plane.data_ptr() == begin + k * first.nbytes

@@ -34,16 +34,26 @@ def point_spectrum(fy: Tensor, fx: Tensor, wavelength: float, depth: float) -> T
 
 
 def band_limited_wave(
-    dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelength: float, depth: float, *, soft: bool
+    shape: tuple[int, int],
+    pitch: tuple[float, float],
+    wavelength: float,
+    depth: float,
+    *,
+    soft: bool,
+    device: torch.device | None = None,
 ) -> Tensor:
-    """Spherical wave whose spectrum is limited to frequencies up to 1 / (2 ``pitch``), complex128 [A, B].
+    """Spherical wave whose spectrum is limited to frequencies up to 1 / (2 ``pitch``), complex128 of ``shape``.
 
-    ``dy`` [A] and ``dx`` [B] are displacements from source to pixel in metres, float64. ``pitch`` (y, x) in metres is
-    at least 0.9 wavelengths. The spectrum falls to 0 as in ``cone.taper`` if ``soft``, else sharply. ValueError if
-    ``depth``, in metres, is so large that the quadrature needs too many nodes.
+    It is sampled at displacements of 0, 1, ... ``pitch`` (y, x) from source to pixel. ``pitch``, in metres, is at least
+    0.9 wavelengths. The spectrum falls to 0 as in ``cone.taper`` if ``soft``, else sharply. ValueError if ``depth``, in
+    metres, is so large that the quadrature needs too many nodes.
     """
+    dy, dx = (
+        torch.arange(count, dtype=torch.float64, device=device) * step for count, step in zip(shape, pitch, strict=True)
+    )
     fy, fx = (
-        _nodes(displacement, step, wavelength, depth, soft) for displacement, step in zip((dy, dx), pitch, strict=True)
+        tuple(values.to(dy.device) for values in _nodes((count - 1) * step, step, wavelength, depth, soft))
+        for count, step in zip(shape, pitch, strict=True)
     )
     # The spectrum is even in fy and in fx, so the integral is a cosine transform over one quadrant.
     columns = 2 * fx[1] * torch.cos(2 * math.pi * dx[:, None] * fx[0])
@@ -56,12 +66,15 @@ def band_limited_wave(
     return total
 
 
-def _nodes(displacement: Tensor, pitch: float, wavelength: float, depth: float, soft: bool) -> tuple[Tensor, Tensor]:
-    """Quadrature nodes between 0 and 1 / (2 ``pitch``), and their weights, which include the taper if ``soft``."""
+def _nodes(displacement: float, pitch: float, wavelength: float, depth: float, soft: bool) -> tuple[Tensor, Tensor]:
+    """Quadrature nodes between 0 and 1 / (2 ``pitch``), and their weights, which include the taper if ``soft``.
+
+    ``displacement`` is the largest one in metres.
+    """
     highest = 1 / (2 * pitch)
     sine = wavelength * highest
-    # Largest derivative of the phase in cycles with respect to frequency: |displacement| + depth * tan(largest angle).
-    slope = displacement.abs().max().item() + depth * sine / math.sqrt(max(1 - 2 * sine**2, 0.1))
+    # Largest derivative of the phase in cycles with respect to frequency: displacement + depth * tan(largest angle).
+    slope = displacement + depth * sine / math.sqrt(max(1 - 2 * sine**2, 0.1))
     if slope * highest / _CYCLES * 64 > _MOST_NODES:
         raise ValueError(
             f"depth {depth:g} m is too far for the sum over a band of pixels of {pitch:g} m: use a nearer plane, a "
@@ -75,4 +88,4 @@ def _nodes(displacement: Tensor, pitch: float, wavelength: float, depth: float, 
         weights.append(np.tile(half * _RULE[1], panels))
     fraction, weight = (torch.from_numpy(np.concatenate(parts)) for parts in (nodes, weights))
     weight = weight * highest * (taper(fraction) if soft else 1.0)
-    return (fraction * highest).to(displacement.device), weight.to(displacement.device)
+    return fraction * highest, weight

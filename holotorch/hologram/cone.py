@@ -16,8 +16,9 @@ amplitude relative to the wave is 0.6 / sqrt(K) for a cone that is K samples wid
 """
 
 import math
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,13 +29,22 @@ from holotorch.optics.free_space.geometry import lateral_spread
 from holotorch.optics.free_space.kernels import turns_phasor
 
 Cone = Literal["full", "box", "disc", "taper", "band"]
+Samples = TypeVar("Samples", Tensor, np.ndarray)
 TAPER_BEGIN = 0.7  # fraction of the highest frequency at which the taper begins
 
 
-def taper(fraction: Tensor) -> Tensor:
+def taper(fraction: Samples) -> Samples:
     """Weight of a frequency, given as a fraction of the highest one: 1 up to 0.7, then a half cosine to 0 at 1."""
-    edge = ((fraction.abs() - TAPER_BEGIN) / (1 - TAPER_BEGIN)).clamp(0, 1)
-    return (1 + torch.cos(math.pi * edge)) / 2
+    edge = ((abs(fraction) - TAPER_BEGIN) / (1 - TAPER_BEGIN)).clip(0, 1)
+    return (1 + functions(edge).cos(math.pi * edge)) / 2
+
+
+def functions(values: Tensor | np.ndarray) -> Any:
+    """``numpy`` or ``torch``, whose functions apply to ``values``.
+
+    What follows from lengths alone is computed with NumPy, which torch.compile and torch.export then do not record.
+    """
+    return np if isinstance(values, np.ndarray) else torch
 
 
 def taper_margin(half_width: float, error: float) -> float:

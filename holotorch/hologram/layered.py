@@ -56,7 +56,9 @@ class LayerHologram(nn.Module):
         count = len(self.depths)
         if layers.ndim < 3 or layers.shape[-3] != count or 0 in layers.shape[-2:]:
             raise ValueError(f"layers must end in (D, h, w) with D = {count} depths, got {tuple(layers.shape)}")
-        return linear(layers, *self._maps((layers.shape[-2], layers.shape[-1])))
+        # The length of a range is a number under torch.compile as well, which then compiles for every size.
+        height, width = (len(range(n)) for n in layers.shape[-2:])
+        return linear(layers, *self._maps((height, width)))
 
     def adjoint(self, field: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
         """Conjugate transpose: layers [..., D, h, w] from a complex field [..., H, W] on the grid of the hologram.

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
+
+from holotorch.hologram.cone import Samples, functions
 
 
 def axial_range(wavelength: float, steepest: Iterable[float]) -> tuple[float, float]:
@@ -51,14 +51,15 @@ class Nodes:
         offset = 2 * (begin[:, None] + np.arange(self.width) - positions[:, None]) / self.width
         return begin.tolist(), np.i0(self._beta * np.sqrt(np.clip(1 - offset**2, 0, None))) * phasors
 
-    def response(self, frequency: Tensor) -> Tensor:
+    def response(self, frequency: Samples) -> Samples:
         """Fourier transform of the window; ``frequency`` is axial frequency minus ``centre``, in cycles per metre."""
+        of = functions(frequency)
         if self.width == 1:
-            return torch.ones_like(frequency)
-        square = self._beta**2 - (math.pi * self.width * self.spacing * frequency).square()
-        root = torch.sqrt(square.abs())
-        inside = torch.where(square > 0, torch.sinh(root.clamp(max=700)), torch.sin(root))
-        return self.width * torch.where(root > 1e-9, inside / root.clamp(min=1e-9), 1)
+            return of.ones_like(frequency)
+        square = self._beta**2 - of.square(math.pi * self.width * self.spacing * frequency)
+        root = of.sqrt(abs(square))
+        inside = of.where(square > 0, of.sinh(root.clip(0, 700)), of.sin(root))
+        return self.width * of.where(root > 1e-9, inside / root.clip(1e-9), 1)
 
     def depth(self, index: int) -> float:
         """Depth of node ``index`` in metres."""
@@ -69,8 +70,7 @@ class Nodes:
         if self.width == 1:
             return 0.0
         frequency = np.linspace(low, high, 33) - self.centre
-        response = self.response(torch.from_numpy(frequency)).numpy()
-        errors = []
+        response, errors = self.response(frequency), []
         for fraction in np.linspace(0, 1, 16, endpoint=False):
             depth = self.first + (self.width + fraction) * self.spacing
             (begin,), weights = self.weights([depth])

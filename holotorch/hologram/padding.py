@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import torch
 from scipy.special import hankel1e
-from torch import Tensor
 
 from holotorch.core.fourier import good_length
-from holotorch.hologram.cone import Cone, taper
+from holotorch.hologram.cone import Cone, Samples, taper
 from holotorch.hologram.raster import strided_length
 
 _LONGEST = 1 << 24  # longest kernel of one axis in samples, which takes 2 GB and several seconds to compute
@@ -77,7 +75,7 @@ class Axis:
     def _error(self, length: int, depth: float) -> float:
         offsets = np.arange(self.displacement + 1)
         sine = np.clip(np.fft.fftfreq(length, self.pitch) * self.wavelength, -0.999, 0.999)
-        weights = faded_out(torch.from_numpy(sine / np.sqrt(1 - sine**2)), *self.fade(length)).numpy()
+        weights = faded_out(sine / np.sqrt(1 - sine**2), *self.fade(length))
         kernel = np.fft.ifft(self._spectrum(length, depth) * weights)[offsets % length]
         # The reference is computed on an array at least four times as long, on which much less light wraps around.
         exact_length = good_length(math.ceil(4 * max(length, self.displacement + self.steepest * depth / self.pitch)))
@@ -95,7 +93,7 @@ class Axis:
         cycles = -depth / self.wavelength * sine**2 / (1 + cosine)
         kernel = np.where(propagates, np.exp(2j * math.pi * (cycles - np.rint(cycles))), 0)
         if self.cone == "taper":
-            kernel = kernel * taper(torch.from_numpy(sine * (2 * self.pitch / self.wavelength))).numpy()
+            kernel = kernel * taper(sine * (2 * self.pitch / self.wavelength))
         return kernel
 
 
@@ -111,9 +109,9 @@ def _exact_kernel(axis: Axis, length: int, depth: float) -> np.ndarray:
     return axis.pitch * wave * np.exp(1j * k * (x**2 / (distance + depth)))
 
 
-def faded_out(values: Tensor, begin: float, end: float) -> Tensor:
+def faded_out(values: Samples, begin: float, end: float) -> Samples:
     """Smooth step from 1 at abs(values) = ``begin`` to 0 at ``end``, with three continuous derivatives."""
-    t = ((values.abs() - begin) / max(end - begin, 1e-12)).clamp(0, 1)
+    t = ((abs(values) - begin) / max(end - begin, 1e-12)).clip(0, 1)
     return 1 - t**4 * (35 - 84 * t + 70 * t**2 - 20 * t**3)
 
 

@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.hologram.band_limited import band_limited_wave
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave
 from holotorch.hologram.layered import LayerHologram
+from holotorch.hologram.raster import has_light
 
 _EXACT = 1e-8  # relative difference below which the closed form of the full wave replaces the tapered wave
 
@@ -33,7 +35,7 @@ class DirectHologram(LayerHologram):
             half = cone_samples(self.grid, self.wavelength, depth) if sharp else (math.inf, math.inf)
             counts = []
             for axis in (0, 1):
-                positions = self._positions(plane.shape[axis], axis)
+                positions = torch.tensor(self._positions(plane.shape[axis], axis))
                 counts.append(((torch.arange(self.grid.shape[axis])[:, None] - positions).abs() <= half[axis]).sum(0))
             total += int(((plane != 0) * (counts[0][:, None] * counts[1])).sum())
         return total
@@ -42,73 +44,86 @@ class DirectHologram(LayerHologram):
         out = layers.new_zeros(len(layers), *self.grid.shape, dtype=torch.complex128)
         for item, field in zip(layers.to(out.dtype), out, strict=True):
             for plane, depth in zip(item, self.depths, strict=True):
-                rows, columns = plane.any(1).nonzero()[:, 0], plane.any(0).nonzero()[:, 0]
-                if len(rows) == 0:
+                rows, columns = _lit(plane)
+                if not rows:
                     continue
-                low, high = int(columns[0]), int(columns[-1]) + 1
-                sources = plane[rows, low:high].flip(-1)
-                positions = self._positions(plane.shape[0], 0, rows.device)[rows]
-                for targets, matrix in self._row_matrices(depth, plane.shape, (low, high), positions):
+                positions = self._positions(plane.shape[0], 0)
+                if len(rows) < len(plane):
+                    plane, positions = plane[rows], [positions[row] for row in rows]
+                sources = plane[:, columns.start : columns.stop].flip(-1)
+                for matrix, pairs in self._row_matrices(depth, plane.shape[1], columns, positions, plane.device):
                     product = sources @ matrix
-                    for inside, target in targets:
+                    for inside, target in pairs:
                         field.index_add_(0, target, product[inside])
         return out.to(layers.dtype)
 
     def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         out = field.new_zeros(len(field), len(self.depths), *shape, dtype=torch.complex128)
-        positions = self._positions(shape[0], 0, field.device)
+        everywhere = range(shape[1]), self._positions(shape[0], 0)
         for item, layers in zip(field.to(out.dtype), out, strict=True):
             for plane, depth in zip(layers, self.depths, strict=True):
                 back = torch.zeros_like(plane)
-                for targets, matrix in self._row_matrices(depth, shape, (0, shape[1]), positions):
+                for matrix, pairs in self._row_matrices(depth, shape[1], *everywhere, item.device):
                     received = item.new_zeros(shape[0], self.grid.shape[1])
-                    for inside, target in targets:
+                    for inside, target in pairs:
                         received[inside] += item[target]
                     back += received @ matrix.mH
                 plane.copy_(back.flip(-1))
         return out.to(field.dtype)
 
-    def _positions(self, sources: int, axis: int, device: torch.device | None = None) -> Tensor:
+    def _positions(self, sources: int, axis: int) -> range:
         """Position of each of the ``sources`` along an axis as a pixel index, possibly outside the hologram."""
-        return (torch.arange(sources, device=device) - sources // 2) * self.stride + self.grid.shape[axis] // 2
+        first = self.grid.shape[axis] // 2 - sources // 2 * self.stride
+        return range(first, first + sources * self.stride, self.stride)
 
     def _row_matrices(
-        self, depth: float, shape: Sequence[int], columns: tuple[int, int], positions: Tensor
-    ) -> Iterator[tuple[list[tuple[Tensor, Tensor]], Tensor]]:
-        """For each distance between a source row and a pixel row, yield all such pairs of rows, and the waves.
+        self, depth: float, width: int, columns: range, positions: Sequence[int], device: torch.device
+    ) -> Iterator[tuple[Tensor, list[tuple[slice, Tensor]]]]:
+        """For each distance between a source row and a pixel row, yield the waves, and all such pairs of rows.
 
-        There is one entry for pixel rows above the source rows and one for those below: a mask of source rows, and the
-        indices of their pixel rows. The waves are complex128 [columns, W], from the last source column to the first.
-        ``shape`` (h, w) is the number of sources of a plane, ``columns`` the first column and the one after the last,
-        ``positions`` the position of each source row as a pixel index.
+        The waves are complex128 [columns, W], from the last source column to the first. There is one entry for pixel
+        rows above the source rows and one for those below: the source rows, and the indices of their pixel rows.
+        ``width`` is the number of sources in a row, ``columns`` are those to compute, and ``positions`` is the position
+        of each source row as a pixel index, rising.
         """
-        (height, width), stride = self.grid.shape, self.stride
-        low, high = columns
-        farthest = max(height - 1 - int(positions.min()), int(positions.max()))
+        (height, pixels), stride = self.grid.shape, self.stride
+        farthest = max(height - 1 - positions[0], positions[-1])
         if self.cone in ("box", "disc"):
             farthest = int(min(farthest, cone_samples(self.grid, self.wavelength, depth)[0] + 1))
         # Displacements of pixels from the last source; those from the source before it begin ``stride`` samples later.
-        index = torch.arange((high - low - 1) * stride + width, device=positions.device)
-        index -= int(self._positions(shape[1], 1)[high - 1])
-        wave_row = self._wave_rows(depth, farthest, int(index.abs().max()), index.device)
+        count, last = (len(columns) - 1) * stride + pixels, self._positions(width, 1)[columns[-1]]
+        index = (torch.arange(count, device=device) - last).abs()
+        wave_row = self._wave_rows(depth, farthest, max(abs(last), abs(count - 1 - last)), device)
+        rows = torch.tensor(positions, device=device)
         for offset in range(farthest + 1):
-            wave = wave_row(offset)[index.abs()]
-            if wave.any():
-                targets = [positions + offset, positions - offset] if offset else [positions]
-                masks = [(target >= 0) & (target < height) for target in targets]
-                pairs = [(mask, target[mask]) for mask, target in zip(masks, targets, strict=True)]
-                yield pairs, wave.as_strided((high - low, width), (stride, 1)).clone()
+            wave = wave_row(offset)[index]
+            if has_light(wave):
+                pairs = []
+                for step in (offset, -offset) if offset else (0,):
+                    inside = slice(*(sum(each < end - step for each in positions) for end in (0, height)))
+                    pairs.append((inside, rows[inside] + step))
+                yield wave.as_strided((len(columns), pixels), (stride, 1)).clone(), pairs
 
     def _wave_rows(self, depth: float, rows: int, columns: int, device: torch.device) -> Callable[[int], Tensor]:
         """Function from a row distance, in samples, to the wave at column distances 0 to ``columns``."""
-        pitch = self.grid.pitch
-        dy, dx = (
-            torch.arange(count + 1, dtype=torch.float64, device=device) * step
-            for count, step in zip((rows, columns), pitch, strict=True)
-        )
+        pitch, counts = self.grid.pitch, (rows + 1, columns + 1)
         plain = self.cone == "taper" and is_plain(self.grid, self.wavelength, depth, (rows, columns), _EXACT)
         if self.cone in ("taper", "band") and not plain:
-            quadrant = band_limited_wave(dy, dx, pitch, self.wavelength, depth, soft=self.cone == "taper")
+            soft = self.cone == "taper"
+            quadrant = band_limited_wave(counts, pitch, self.wavelength, depth, soft=soft, device=device)
             return lambda offset: quadrant[offset]
         cone: Cone = "full" if plain else self.cone
+        dy, dx = (
+            torch.arange(count, dtype=torch.float64, device=device) * step
+            for count, step in zip(counts, pitch, strict=True)
+        )
         return lambda offset: spherical_wave(dy[offset], dx, pitch, self.wavelength, depth, cone)
+
+
+def _lit(plane: Tensor) -> tuple[Sequence[int], range]:
+    """Rows of a plane [h, w] that may have light, and the range of columns between the outermost ones that may."""
+    height, width = plane.shape
+    if not checks.readable(plane):
+        return range(height), range(width)
+    rows, columns = (plane.any(axis).nonzero().flatten().tolist() for axis in (1, 0))
+    return rows, range(columns[0], columns[-1] + 1) if columns else range(0)

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.core.fourier import fft2, good_length, ifft2
 from holotorch.core.grid import Grid
 
@@ -78,11 +79,9 @@ def strided_length(minimum: int, stride: int) -> int:
     return stride * good_length(-(-minimum // stride))
 
 
-def has_light(plane: Tensor) -> bool:
-    """Whether any element differs from zero; NaN does. For speed, a few elements are tested before all of them.
+def has_light(values: Tensor) -> bool:
+    """Whether an element may differ from zero; NaN does. Values that are not ``checks.readable`` may.
 
-    Planes without values, which torch.compile and the meta device have, count as lit.
+    For speed, a few elements are tested before all of them.
     """
-    if torch.compiler.is_compiling() or plane.is_meta:
-        return True
-    return bool(plane.flatten()[::251].any() or plane.any())
+    return not checks.readable(values) or bool(values.flatten()[::251].any() or values.any())

@@ -214,10 +214,8 @@ def _shifted_sum(image: Tensor, taps: Tensor) -> Tensor:
     rows, columns = taps.shape
     height, width = image.shape[-2:]
     padded = _padded(image, taps.shape)
-    if torch.compiler.is_compiling() or image.device.type != "cpu":
-        values = [row.unbind() for row in taps.to(image).unbind()]
-    else:  # numbers are faster than tensors, and reading them waits for nothing on a CPU
-        values = taps.tolist()
+    # Numbers are faster than tensors.
+    values = taps.tolist() if checks.readable(image) else [row.unbind() for row in taps.to(image).unbind()]
     result = torch.zeros_like(image)
     for i, j in itertools.product(range(rows), range(columns)):
         tap, y, x = values[i][j], rows - 1 - i, columns - 1 - j

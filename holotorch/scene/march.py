@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from holotorch.core import checks
 from holotorch.scene.compositing import absorb, corrected_opacity, safe_sqrt
 from holotorch.scene.lighting import Lighting, Scattering, flat_steps, slice_slopes, slopes
 from holotorch.scene.placement import Placement, Rays
@@ -33,6 +34,9 @@ class March:
     A voxel is visible if its opacity is above 0. The attribute ``window`` holds the rays that may meet visible voxels;
     only these are computed. ``visible`` is the range of depths in metres of the bricks that contain visible voxels, or
     None if there are none. ValueError if a voxel is NaN or infinite.
+
+    Volumes without values, as under ``torch.compile``, are not checked, and none of their rays and voxels is left out;
+    the result is the same.
     """
 
     volume: Volume  # scalar field
@@ -51,12 +55,13 @@ class March:
         self.channels = transfer.colours.shape[1]
         if volume.values.is_floating_point():
             self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
-        low, high = volume.bricks(BRICK)
-        # If voxels are optimised none is skipped, since transparent voxels have a gradient as well.
-        self.learned = volume.values.requires_grad
-        self.occupied = torch.ones_like(low, dtype=torch.bool) if self.learned else transfer.visible(low, high)
+        # If voxels are optimised none is skipped, since transparent voxels have a gradient as well. Without values,
+        # which of them are transparent is unknown.
+        self.learned, self.known = volume.values.requires_grad, checks.have_values(volume.values, transfer.opacities)
+        bricks = volume.bricks(BRICK) if self.known else None
+        self.occupied = None if self.learned or bricks is None else transfer.visible(*bricks)
         box = occupied_box(self.occupied, volume.shape)
-        self.visible = place.depth_range(*box) if box is not None else None
+        self.visible = place.depth_range(*box) if box is not None and self.known else None
         rows, columns = place.footprint(rays, *box) if box is not None else (range(0), range(0))
         self.window = Window.of(place, rays, rows, columns, torch.empty((), dtype=self.dtype, device=self.device))
 
@@ -84,7 +89,7 @@ class March:
             transmittance = transmittance * wanted[rows.start : rows.stop, columns.start : columns.stop].flatten()
         for plane, (low, high) in enumerate(self.spans):
             alive = transmittance.detach() > self.early
-            if not alive.any():
+            if self.known and not alive.any():
                 return
             low, high = max(low, near) - place.distance, min(high, far) - place.distance
             sampled = reader.read(low, high, alive) if low < high else None
@@ -143,7 +148,7 @@ class March:
 
     def _reader(self) -> SliceReader | PointReader:
         """Reader whose first channel is the value; lighting adds three slopes, scattering its illumination."""
-        support = (-math.inf, math.inf) if self.learned else self.transfer.support()
+        support = (-math.inf, math.inf) if self.occupied is None else self.transfer.support()
         common = (self.place, self.rays, self.window, self.occupied, support)
         values, light = self.volume.values, None
         steps = flat_steps(self.volume) if isinstance(self.lighting, Lighting) else None

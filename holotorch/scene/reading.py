@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.scene.placement import Placement, Rays
 
 BRICK = 16  # edge length in voxels of the blocks of a volume that are skipped if they are transparent
@@ -73,7 +74,7 @@ class SliceReader:
     place: Placement  # position of the volume
     rays: Rays  # geometry of the rays
     window: Window  # rays that are read
-    occupied: Tensor  # whether each brick of the volume contains a visible voxel, bool [Dz, Hy, Wx]
+    occupied: Tensor | None  # whether each brick contains a visible voxel, bool [Dz, Hy, Wx]; None if all may
     support: tuple[float, float]  # limits of the visible values, see ``TransferFunction.support``
     # Function from the number of a slice to its channels [c, H, W], of which the first is the value.
     channels: Callable[[int], Tensor]
@@ -87,34 +88,43 @@ class SliceReader:
         depth = (low + high) / 2
         index = min(max(depth / place.spacing[0] + (place.shape[0] - 1) / 2, 0.0), place.shape[0] - 1.0)
         k = min(int(index), max(0, place.shape[0] - 2))
-        occupied = self.occupied[k // BRICK].any(1).nonzero()
-        if not len(occupied):
-            return None
         scale = self.rays.scale(place.distance + depth)
         first, row_weight = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
-        # The index of the voxel rises with the row of the ray, so the rows that meet occupied bricks are one range.
-        limits = first.new_tensor([int(occupied[0]) * BRICK, (int(occupied[-1]) + 1) * BRICK])
-        start, stop = (int(row) for row in torch.searchsorted(first, limits))
+        start, stop = self._rows(k, first)
         if start >= stop:
             return None
         length = self.window.length(low, high, slice(start, stop))
         mask = alive[start * width : stop * width]
         if isinstance(length, Tensor):
-            mask = mask & (length > 0).flatten()
+            length = length.flatten()
+            mask = mask & (length > 0)
         left, column_weight = _taps(self.window.across * scale, place.shape[2], place.spacing[2])
         plane = self.channels(k)
         plane = plane if index == k else torch.lerp(plane, self.channels(k + 1), index - k)
         lines = interpolate(plane, left, column_weight, -1)
         first, row_weight = first[start:stop], row_weight[start:stop]
         values = interpolate(lines[:1], first, row_weight, -2).flatten(1)
-        rays = (mask & _visible(values[0], self.support)).nonzero().flatten()
+        rays, length = _selected(mask & _visible(values[0], self.support), length, values.dtype)
         if not rays.numel():
             return None
         samples = values.index_select(1, rays)
         if len(lines) > 1:
             samples = torch.cat([samples, _between_rows(lines[1:], first, row_weight, rays)])
-        length = length.flatten().index_select(0, rays) if isinstance(length, Tensor) else length
         return RaySamples(rays + start * width, samples, length)
+
+    def _rows(self, k: int, first: Tensor) -> tuple[int, int]:
+        """First row and the one after the last of the rays that meet occupied bricks between slices ``k`` and k + 1.
+
+        ``first`` is the index of the voxel before each row. It rises, so these rows are one range.
+        """
+        if self.occupied is None:
+            return 0, len(first)
+        occupied = self.occupied[k // BRICK].any(1).nonzero()
+        if not len(occupied):
+            return 0, 0
+        limits = first.new_tensor([int(occupied[0]) * BRICK, (int(occupied[-1]) + 1) * BRICK])
+        start, stop = (int(row) for row in torch.searchsorted(first, limits))
+        return start, stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +134,7 @@ class PointReader:
     place: Placement
     rays: Rays
     window: Window
-    occupied: Tensor
+    occupied: Tensor | None
     support: tuple[float, float]
     channels: Tensor
 
@@ -134,16 +144,16 @@ class PointReader:
         length = window.length(low, high, slice(None))
         assert isinstance(length, Tensor)  # one length for all rays occurs only without rotation
         length = length.flatten()
-        rays = (alive & (length > 0)).nonzero().flatten()
+        rays, length = _selected(alive & (length > 0), length, self.channels.dtype)
         down, across = place.offsets(self.rays, place.distance + (low + high) / 2, window.down, window.across)
         # Offsets from the centre of the volume, in samples.
         spacing = down.new_tensor(place.spacing)
         down, across = ((offset / spacing).to(self.channels.dtype) for offset in (down, across))
         row = torch.div(rays, len(window.columns), rounding_mode="floor")
         points = down.index_select(0, row) + across.index_select(0, rays - row * len(window.columns))
-        if not self.occupied.all():
-            visible = self._in_bricks(points)
-            rays, points = rays[visible], points.index_select(0, visible)
+        if self.occupied is not None and not self.occupied.all():
+            visible = self._in_bricks(points, self.occupied)
+            rays, points, length = rays[visible], points.index_select(0, visible), length[visible]
         if not rays.numel():
             return None
         ends = points.new_tensor([max(1, n - 1) / 2 for n in place.shape])
@@ -151,22 +161,28 @@ class PointReader:
         samples = torch.nn.functional.grid_sample(
             self.channels[None], (points / ends).flip(-1)[None, None, None], padding_mode="border", align_corners=True
         )[0, :, 0, 0]
-        kept = _visible(samples[0], self.support).nonzero().flatten()
-        if kept.numel() < rays.numel():
-            rays, samples = rays[kept], samples.index_select(1, kept)
-        return RaySamples(rays, samples, length.index_select(0, rays)) if rays.numel() else None
+        if self.occupied is not None:
+            kept = _visible(samples[0], self.support).nonzero().flatten()
+            if kept.numel() < rays.numel():
+                rays, samples, length = rays[kept], samples.index_select(1, kept), length[kept]
+        return RaySamples(rays, samples, length) if rays.numel() else None
 
-    def _in_bricks(self, points: Tensor) -> Tensor:
+    def _in_bricks(self, points: Tensor, occupied: Tensor) -> Tensor:
         """Indices of the points [n, 3] that lie in occupied bricks."""
         flat = torch.zeros_like(points[:, 0], dtype=torch.int64)
-        for axis, (n, bricks) in enumerate(zip(self.place.shape, self.occupied.shape, strict=True)):
+        for axis, (n, bricks) in enumerate(zip(self.place.shape, occupied.shape, strict=True)):
             brick = ((points[:, axis] + (n - 1) / 2).clamp_(0, n - 1) * (1 / BRICK)).to(torch.int64)
             flat = flat * bricks + brick
-        return self.occupied.flatten()[flat].nonzero().flatten()
+        return occupied.flatten()[flat].nonzero().flatten()
 
 
-def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[float], list[float]] | None:
-    """Smallest and largest index coordinates (z, y, x) of the occupied bricks of a volume; None if there are none."""
+def occupied_box(occupied: Tensor | None, shape: tuple[int, int, int]) -> tuple[list[float], list[float]] | None:
+    """Smallest and largest index coordinates (z, y, x) of the occupied bricks of a volume; None if there are none.
+
+    ``occupied`` is bool [Dz, Hy, Wx], or None if all bricks are.
+    """
+    if occupied is None:
+        return [-0.5] * 3, [n - 0.5 for n in shape]
     bricks = occupied.nonzero()
     if not len(bricks):
         return None
@@ -174,6 +190,17 @@ def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[fl
     low = [brick * BRICK if brick else -0.5 for brick in first]
     high = [min((brick + 1) * BRICK, n - 0.5) for brick, n in zip(last, shape, strict=True)]
     return low, high
+
+
+def _selected(mask: Tensor, length: Tensor | float, dtype: torch.dtype) -> tuple[Tensor, Tensor | float]:
+    """Indices of the rays in ``mask``, bool [n], and the lengths of their paths, of ``length`` [n] or one for all.
+
+    Without values all rays are selected. Those that are not in ``mask`` have no path then, and absorb nothing.
+    """
+    if checks.have_values(mask):
+        rays = mask.nonzero().flatten()
+        return rays, length.index_select(0, rays) if isinstance(length, Tensor) else length
+    return torch.arange(len(mask), device=mask.device), mask.to(dtype) * length
 
 
 def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:

@@ -204,7 +204,7 @@ class DVRSampler(nn.Module):
     def _march(self, volume: Volume) -> March:
         march = self._placed(volume, self.grid)
         self._warn_of_lost_depth(march)
-        if self.checks_slabs and march.thickest > _THICK and not march.learned and not volume.values.is_meta:
+        if self.checks_slabs and march.thickest > _THICK and march.known and not march.learned:
             self.checks_slabs = False
             if (error := self.slab_error(volume)) > _COARSE:
                 warnings.warn(

@@ -6,6 +6,7 @@ import torch
 from oracles import holograms
 
 from holotorch import Grid
+from holotorch.core import checks
 from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram
 
 BOTH = [DirectHologram, ConvolutionHologram]
@@ -117,6 +118,27 @@ def test_planes_without_light_contribute_nothing(kind):
     one[1, 2, 3] = torch.tensor(2j)  # on the axis
     only = kind(GRID, WAVE, (2e-3,))(torch.full((1, 1, 1), 2j, dtype=torch.complex128))
     assert relative(operator(one), only) < 1e-13
+
+
+@pytest.mark.parametrize("kind", [*BOTH, AxialHologram])
+def test_what_is_dark_changes_nothing_where_it_cannot_be_asked_for(kind, monkeypatch):
+    """On a GPU, planes, rows and columns without light are computed like the others."""
+    layers = sources(3, 13, 20)
+    layers[1], layers[2, :4], layers[0, :, 15:] = 0, 0, 0
+    operator = kind(GRID, WAVE, (0.3e-3, 0.34e-3, 0.35e-3), cone="taper")
+    wanted = operator(layers)
+    monkeypatch.setattr(checks, "readable", lambda *tensors: False)
+    assert relative(operator(layers), wanted) < 1e-14
+
+
+@pytest.mark.parametrize("kind", [*BOTH, AxialHologram])
+def test_a_compiled_hologram_takes_layers_of_several_sizes(kind):
+    torch.compiler.reset()
+    operator = kind(GRID, WAVE, (0.3e-3, 0.34e-3), cone="taper")
+    compiled = torch.compile(operator, fullgraph=True, backend="eager")
+    for shape in ((4, 5), (6, 3), (4, 5)):
+        layers = sources(2, *shape)
+        assert relative(compiled(layers), operator(layers)) < 1e-14
 
 
 def test_full_waves_alias_where_the_cone_is_narrower_than_the_window():

@@ -6,8 +6,10 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from host_reads import HostReads
 
 from holotorch import Grid
+from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.scene.phases import point_phases, random_phase
 from holotorch.scene.sampler import DVRSampler
@@ -51,6 +53,24 @@ GEOMETRIES = {
     "from an eye": {"eye": -0.01},
     "turned": {"rotation": TURN, "boundaries": CUTS},
 }
+
+
+@pytest.mark.parametrize("geometry", GEOMETRIES)
+def test_without_values_nothing_is_asked_and_the_result_is_the_same(geometry, monkeypatch):
+    """As under torch.compile: no ray is taken out of the march, also none that has ended."""
+    volume, chosen = sparse(), torch.rand(GRID.shape) > 0.2
+    rendering = sampler(transfer((0.0, 0.2, 1.0), unit=0.02), early=0.1, **GEOMETRIES[geometry])
+    rendering.checks_slabs = False
+    wanted = *rendering.render(volume, chosen), rendering(volume).stack(), rendering.depth_map(volume)
+    with monkeypatch.context() as patch, HostReads() as reads:
+        patch.setattr(checks, "have_values", lambda *tensors: False)
+        got = *rendering.render(volume, chosen), rendering(volume).stack(), rendering.depth_map(volume)
+    assert reads.count == 0
+    for one, other in zip(got, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-15)
+    there = Volume(volume.values.to("meta"), volume.spacing, volume.unit)
+    picture, _ = rendering.to("meta").render(there)
+    assert picture.is_meta and picture.shape == (3, *GRID.shape)
 
 
 def test_eye_far_away_sees_what_parallel_rays_see():

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.core.special import chirped_fresnel_integral
 from holotorch.optics.free_space.kernels import direction_cosine, turns_phasor
 
@@ -64,8 +65,8 @@ def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tenso
     cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
     cycles = -distance / wavelength * torch.where(travels, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
     phase = turns_phasor(cycles)
-    # Without evanescent waves there is no decay. This check is too slow on a GPU, and impossible under compile.
-    if sine2.device.type == "cpu" and not torch.compiler.is_compiling() and not bool((sine2 > 1).any()):
+    # Without evanescent waves there is no decay.
+    if checks.readable(sine2) and not bool((sine2 > 1).any()):
         return phase
     _, imaginary = direction_cosine(sine2)
     return phase * torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary)

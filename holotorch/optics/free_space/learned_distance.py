@@ -16,6 +16,7 @@ from scipy.special import wofz
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.padding import FINEST
 from holotorch.optics.free_space.plane_pair import PlanePair
@@ -35,7 +36,7 @@ def has_closed_form(planes: PlanePair, wavelength: Tensor, distance: Tensor) -> 
     """
     if not (distance.requires_grad and torch.is_grad_enabled()) or wavelength.requires_grad or distance.numel() != 1:
         return False
-    if torch.compiler.is_compiling() or distance.device.type != "cpu" or not planes.straight:
+    if not checks.readable(distance) or not planes.straight:
         return False
     if torch._C._are_functorch_transforms_active() or forward_ad.unpack_dual(distance).tangent is not None:
         return False
