@@ -95,15 +95,15 @@ class SharedIntensity(nn.Module):
 
     This replaces the propagator of a ``PECProblem`` whose solver runs in every process. All processes receive the
     intensities of all, and the gradient with respect to the whole field. Nothing is summed in another order than in one
-    process, so that the solvers of all processes take the same steps as that of one.
+    process; only transforms of fewer fields at a time may round differently.
 
     Args:
         make: Function that makes the propagator of some colours, given by their indices.
         colours: Number of colours C.
         frames: Number of frames; the product of the axes in front of C.
 
-    Raises ConnectionError in a call if a process has ended, and RuntimeError if the fields of the processes differ, as
-    they may on processors of different types.
+    Raises ConnectionError in a call if a process has ended, or if the fields of the processes differ, as they may on
+    processors of different types.
     """
 
     def __init__(self, make: Callable[[Sequence[int]], nn.Module], colours: int, frames: int):
@@ -119,7 +119,7 @@ class SharedIntensity(nn.Module):
         with _connected():
             torch.distributed.all_reduce(extremes, torch.distributed.ReduceOp.MAX)
         if extremes.sum() > 0:
-            raise RuntimeError("the fields of the processes differ; start the run on processors of one type")
+            raise ConnectionError("the fields of the processes differ; start the run on processors of one type")
         return _Shared.apply(field, self)
 
     def own(self, values: Tensor) -> Tensor:
