@@ -24,7 +24,7 @@ ROOMS = {
     ],
     "experiments": [
         {"measure", "view"},
-        {"panel", "sweep", "pec_study", "stability", "tracking_benchmark", "streaming"},
+        {"panel", "sweep", "pec_study", "scaling", "stability", "tracking_benchmark", "streaming"},
         {"joint"},
         {"eye"},
         {"camera", "network", "pec", "volume", "perception", "propagation", "tracking"},

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +19,7 @@ from holotorch.experiments.joint import budget as shares
 from holotorch.experiments.joint.config import JointSettings, volume_settings
 from holotorch.experiments.planning.correction import PROPAGATION, measured_crosstalk
 from holotorch.experiments.planning.tolerance import Budget
+from holotorch.experiments.runs.processes import SharedIntensity, process_count
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.experiments.volume.experiment import build as build_volume
@@ -236,11 +238,16 @@ class JointExperiment:
             return crosstalk
         return HeatCycle(crosstalk, heat.frame_us * 1e-6, heat.time_constant_us * 1e-6).to(self.device)
 
-    def problem(self, heat: ThermalCrosstalk | HeatCycle, views: Views, limit: float | None) -> PECProblem:
-        """The loss of F frames: squared differences of the amplitudes in all views, with one scale for each colour."""
+    def problem(
+        self, heat: ThermalCrosstalk | HeatCycle, views: Views, limit: float | None, *, shared: bool = False
+    ) -> PECProblem:
+        """The loss of F frames: squared differences of the amplitudes in all views, with one scale for each colour.
+
+        With ``shared``, the processes of a run compute it together, and all of them must call it.
+        """
         return PECProblem(
             heat,
-            views.operator,
+            self._intensities(views.operator) if shared and process_count()[1] > 1 else views.operator,
             views.images,
             frames=True,
             amplitude=True,
@@ -250,6 +257,19 @@ class JointExperiment:
             limit=None if limit is None else _PENALTY_FROM * limit,
             light_weight=self.settings.light_weight,
         )
+
+    def _intensities(self, whole: PupilViews) -> SharedIntensity:
+        """The images of all views, of which this process computes those of some frames and colours."""
+
+        def own(colours: Sequence[int]) -> PupilViews:
+            if len(colours) == len(whole.wavelengths):
+                return whole
+            wavelengths = [whole.wavelengths[colour] for colour in colours]
+            part = PupilViews(whole.grid, wavelengths, whole.views, longest=self.padding * max(self.foci))
+            assert part.padded == whole.padded  # the pupils, not the wavelengths, bound the directions of the light
+            return part.to(self.device)
+
+        return SharedIntensity(own, len(whole.wavelengths), self.settings.frames)
 
     def _weights(self, views: Views) -> Tensor:
         radii = torch.tensor([view.radius for view in views.operator.views])
@@ -278,8 +298,11 @@ class JointExperiment:
         return LBFGS(max_steps=self.settings.steps, precondition=spread_preconditioner(crosstalk.kernel), **rule)
 
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
-        """Heater phases [F, C, H, W] that form all views at once, from the kinoforms of random fields."""
-        problem = self.problem(self.heat, self.trained, self.settings.limit)
+        """Heater phases [F, C, H, W] that form all views at once, from the kinoforms of random fields.
+
+        All processes of a run must call this.
+        """
+        problem = self.problem(self.heat, self.trained, self.settings.limit, shared=True)
         start = self.kinoform(self.random_fields(), self.crosstalk).to(self.dtype)
         return self.solver(self.crosstalk)(problem, start, callback=progress, resume=resume)
 

@@ -20,6 +20,7 @@ class JointKind(ExperimentKind[JointSettings, "JointExperiment"]):
 
     settings = JointSettings
     example = "configs/joint/teapot.yaml"
+    parallel = True
 
     def contradictions(self, settings: JointSettings) -> list[tuple[Key, str]]:
         return contradictions(settings)

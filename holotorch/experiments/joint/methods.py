@@ -9,8 +9,11 @@ from holotorch.core.complex import intensity
 from holotorch.correction import deconvolve, gerchberg_saxton, iterative_pec
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.runs.processes import added, process_count
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics.viewing.pupil_views import PupilViews
+
+SHARED = ("unheated", "slabs")  # methods whose work several processes divide
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,10 @@ def show(experiment: JointExperiment, phase: Tensor, laser: Tensor | None = None
 
 
 def baseline(experiment: JointExperiment, name: str) -> Shown:
-    """One of the methods of ``names.NAMES``, other than the joint correction."""
+    """One of the methods of ``names.NAMES``, other than the joint correction.
+
+    Those of ``SHARED`` must be called by all processes of a run, and are the same in all.
+    """
     if name == "random":
         return Shown(experiment.random_fields())
     if name == "afterwards":
@@ -50,7 +56,7 @@ def baseline(experiment: JointExperiment, name: str) -> Shown:
 
 def _unheated(experiment: JointExperiment) -> Tensor:
     cold = ThermalCrosstalk(0.0).to(experiment.device)
-    problem = experiment.problem(cold, experiment.trained, None)
+    problem = experiment.problem(cold, experiment.trained, None, shared=True)
     phase = experiment.solver(cold)(problem, experiment.kinoform(experiment.random_fields(), cold)).x
     return deconvolve(experiment.crosstalk, phase % (2 * torch.pi) + torch.pi)
 
@@ -68,12 +74,16 @@ def _retrieved(experiment: JointExperiment, corrected: bool) -> Tensor:
 
 
 def _slabs(experiment: JointExperiment) -> Shown:
-    """Each frame shows the light of one plane where it is in focus; a plane has the power of its light."""
+    """Each frame shows the light of one plane where it is in focus; a plane has the power of its light.
+
+    The processes of a run divide the planes.
+    """
+    rank, count = process_count()
     frames, planes = experiment.settings.frames, len(experiment.depths)
     phase = torch.zeros(frames, len(experiment.settings.wavelengths), *experiment.grid.shape, device=experiment.device)
     laser = torch.zeros(phase.shape[:2], device=experiment.device)
     fields = experiment.random_fields
-    for j in range(planes):
+    for j in range(rank, planes, count):
         own, views = list(range(j, frames, planes)), experiment.plane(j)
         lit = views.images.flatten(1).amax(-1) > 0
         if not bool(lit.any()):
@@ -87,4 +97,4 @@ def _slabs(experiment: JointExperiment) -> Shown:
         formed = problem.intensity(x).detach()
         phase[own] = x
         laser[own] = best_scale(formed, views.images, -3) * lit * (frames / len(own))
-    return show(experiment, phase, laser)
+    return show(experiment, added(phase), added(laser))

@@ -12,11 +12,12 @@ from holotorch.experiments.joint import pictures
 from holotorch.experiments.joint.evaluation import evaluate, per_view
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.measured import joint_errors
-from holotorch.experiments.joint.methods import Shown, baseline, show
+from holotorch.experiments.joint.methods import SHARED, Shown, baseline, show
 from holotorch.experiments.planning.errors import measured_values
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
+from holotorch.experiments.runs.processes import from_first, process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
@@ -28,17 +29,27 @@ _SAVE_EVERY = 30.0  # seconds between two checkpoints
 
 
 def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
-    """Solve for the phases, evaluate them and the other methods, and fill the folder; True if the run is complete."""
+    """Solve for the phases, evaluate them and the other methods, and fill the folder; True if the run is complete.
+
+    Several processes share the solvers; only the first one evaluates and fills the folder.
+    """
+    if process_count()[0] > 0:
+        experiment.solve(resume=from_first(None))
+        for name in experiment.settings.report.baselines:
+            if name in SHARED:
+                baseline(experiment, name)
+        return True
     out, pressed, files = opened.path, opened.pressed, Results()
     (out / "arrays").mkdir(exist_ok=True)
     log = Log(experiment, Checkpoint(out / "checkpoint.pt", _fingerprint(experiment)))
     try:
-        solution = experiment.solve(log, log.resume)
+        solution = experiment.solve(log, from_first(log.resume))
     except KeyboardInterrupt:
         solution = log.last
     finally:
-        log.bar.close()
-        log.save()
+        with deferred(pressed):  # torchrun sends a signal when another process has ended
+            log.bar.close()
+            log.save()
     if solution is None:
         raise KeyboardInterrupt
     with deferred(pressed):  # from here on Ctrl-C takes effect only after the results are saved

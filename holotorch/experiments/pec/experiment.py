@@ -2,12 +2,13 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import intensity
@@ -34,6 +35,7 @@ from holotorch.experiments.pec.weight import weight_map
 from holotorch.experiments.planning.correction import measured_crosstalk, solver_precision
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.runs.environment import find_device
+from holotorch.experiments.runs.processes import SharedIntensity, process_count
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
@@ -175,22 +177,38 @@ class PECExperiment:
     @cached_property
     def propagator(self) -> SpectralFilter | Fraunhofer | DepthStack:
         """Propagator from the array to the image; built on first use, because its kernel takes much memory."""
+        return self._propagator(self.wavelengths)
+
+    @cached_property
+    def _intensities(self) -> SharedIntensity:
+        """The same for the solver of a run that several processes share: intensities, each a part of them."""
+
+        def own(colours: Sequence[int]) -> nn.Module:
+            return self._propagator([self.wavelengths[colour] for colour in colours])
+
+        return SharedIntensity(own, len(self.wavelengths), self.settings.frames)
+
+    def _propagator(self, wavelengths: Sequence[float]) -> SpectralFilter | Fraunhofer | DepthStack:
         if not self.distances:
-            return Fraunhofer(self.grid, self.wavelengths).to(self.device)
-        filters = [self._to_distance(distance).to(self.device) for distance in self.distances]
+            return Fraunhofer(self.grid, wavelengths).to(self.device)
+        filters = [self._to_distance(distance, wavelengths).to(self.device) for distance in self.distances]
         return filters[0] if len(filters) == 1 else DepthStack(filters)
 
-    def _to_distance(self, distance: float) -> SpectralFilter:
+    def _to_distance(self, distance: float, wavelengths: Sequence[float]) -> SpectralFilter:
         paraxial = self.settings.propagator.kind == "fresnel"
         if self.isolated:
-            return CroppedKernel(self.grid, self.wavelengths, distance, paraxial=paraxial)
+            return CroppedKernel(self.grid, wavelengths, distance, paraxial=paraxial)
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan reports it in a note
             if paraxial:
-                return Fresnel(self.grid, self.wavelengths, distance, pad=1)
-            return AngularSpectrum(self.grid, self.wavelengths, distance, pad=1, band_limit=False)
+                return Fresnel(self.grid, wavelengths, distance, pad=1)
+            return AngularSpectrum(self.grid, wavelengths, distance, pad=1, band_limit=False)
 
-    def problem(self, dtype: torch.dtype | None = None, **options) -> PECProblem:
-        """The objective over the lit colours; ``options`` of :class:`PECProblem` replace those of the configuration."""
+    def problem(self, dtype: torch.dtype | None = None, *, shared: bool = False, **options) -> PECProblem:
+        """The objective over the lit colours.
+
+        With ``shared``, the processes of a run compute it together, and all of them must call it. ``options`` of
+        :class:`PECProblem` replace those of the configuration.
+        """
         weights, dtype = self.weights, dtype or self.dtype
         configured: dict[str, Any] = {
             "mask": None if weights is None else weights.to(self.device, dtype),
@@ -199,7 +217,8 @@ class PECExperiment:
             "power_weight": self.settings.modulator.power_weight,
         }
         target = self.target.to(self.device, dtype)
-        return PECProblem(self.array.crosstalk, self.propagator, target, **configured | options)
+        propagator = self._intensities if shared and process_count()[1] > 1 else self.propagator
+        return PECProblem(self.array.crosstalk, propagator, target, **configured | options)
 
     def intensity(self, phase: Tensor) -> Tensor:
         """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W]."""
@@ -252,20 +271,23 @@ class PECExperiment:
         # Rounded phases may exceed the limit, so they are scaled last, all levels by the same factor.
         return phase if limit is None else limit_peak_phase(limit, phase, self.array.crosstalk)
 
-    def stages(self) -> list[Stage]:
-        """The stages of the configured solver in order."""
+    def stages(self, *, shared: bool = False) -> list[Stage]:
+        """The stages of the configured solver in order; ``shared`` as in :meth:`problem`."""
+        problem = partial(self.problem, shared=shared)
         kind, crosstalk = self.settings.solver.kind, self.array.crosstalk
         options = self.settings.solver.model_dump(exclude={"kind", "start", "reruns"})
         options["tolerance"] = shares.stop(self.settings, self.budget)
         if kind == "lbfgs":
             solver = LBFGS(precondition=spread_preconditioner(crosstalk.kernel), **options)
-            return penalty_schedule(self.problem, solver, crosstalk.total, self.limit)
-        return [Stage(self.problem(), APG(**options) if kind == "apg" else ProjectedAdam(**options))]
+            return penalty_schedule(problem, solver, crosstalk.total, self.limit)
+        return [Stage(problem(), APG(**options) if kind == "apg" else ProjectedAdam(**options))]
 
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
-        """Run the configured solver on the lit colours. ConfigError if it cannot start."""
+        """Run the configured solver on the lit colours, in all processes of a run. ConfigError if it cannot start."""
         try:
-            return run_stages(self.stages(), self.start_phase().to(self.dtype), callback=progress, resume=resume)
+            return run_stages(
+                self.stages(shared=True), self.start_phase().to(self.dtype), callback=progress, resume=resume
+            )
         except ValueError as error:
             raise ConfigError([f"the solver cannot start: {error}"]) from error
 

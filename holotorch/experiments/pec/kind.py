@@ -21,6 +21,7 @@ class PECKind(ExperimentKind[PECSettings, "PECExperiment"]):
 
     settings = PECSettings
     example = "configs/pec/fourier.yaml"
+    parallel = True
 
     def contradictions(self, settings: PECSettings) -> list[tuple[Key, str]]:
         return list(contradictions(settings))

@@ -13,6 +13,7 @@ from holotorch.experiments.pec.evaluation import quality
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.saving import Checkpoint
+from holotorch.experiments.runs.signals import deferred
 
 CHECK_STEPS = 10  # solver steps between two scores of the hologram; scoring takes about as long as a step
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
@@ -92,13 +93,18 @@ class Log:
         return self.checkpoint.save(content)
 
     @contextmanager
-    def saved_on_failure(self) -> Iterator[None]:
-        """Save the latest step if the block raises an exception, so that ``holotorch resume`` repeats no steps."""
+    def saved_on_failure(self, pressed: list[int]) -> Iterator[None]:
+        """Save the latest step if the block raises an exception, so that ``holotorch resume`` repeats no steps.
+
+        A signal that follows the exception, as ``torchrun`` sends one when another process has ended, only goes into
+        the list ``pressed`` meanwhile.
+        """
         try:
             yield
         except Exception:
-            if not (self.checkpoint.path.parent / "summary.json").is_file():
-                self.save()
+            with deferred(pressed):
+                if not (self.checkpoint.path.parent / "summary.json").is_file():
+                    self.save()
             raise
 
     def table(self) -> str:

@@ -22,6 +22,7 @@ from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.pictures import save_picture
+from holotorch.experiments.runs.processes import collected, from_first, process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.timing import timed
@@ -29,13 +30,22 @@ from holotorch.io.files import save_array, write_bytes, write_text
 
 
 def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
-    """Solve for the phases, evaluate them and the baselines, and fill the folder. True if the run is complete."""
+    """Solve for the phases, evaluate them and the baselines, and fill the folder. True if the run is complete.
+
+    Several processes share the solver and the baselines; only the first one fills the folder.
+    """
     settings, out, pressed = experiment.settings, opened.path, opened.pressed
+    if process_count()[0] > 0:
+        solution = experiment.solve(resume=from_first(None))
+        if settings.solver.reruns:
+            rerun(experiment, solution, 0.0)
+        _baselines(experiment, pressed)
+        return True
     (out / "arrays").mkdir(exist_ok=True)
     log, files = Log(experiment, Checkpoint(out / "checkpoint.pt", _fingerprint(experiment))), Results()
-    with log.saved_on_failure():
+    with log.saved_on_failure(pressed):
         try:
-            solution = experiment.solve(log, log.resume)
+            solution = experiment.solve(log, from_first(log.resume))
         except KeyboardInterrupt:
             solution = log.last
         finally:
@@ -55,16 +65,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
             results = {"corrected": _result(experiment, solution, seconds)}
             results["corrected"].numbers.update(attempts)
             files.write(save_array, out / "arrays" / "phase.npy", results["corrected"].phase.float())
-        for name in settings.report.baselines:
-            try:
-                if not pressed:
-                    unweighted = name == "unweighted"
-                    solve = experiment.unweighted.solve if unweighted else partial(baseline, experiment, name)
-                    results[name] = _result(experiment, *timed(solve), single=not unweighted)
-            except KeyboardInterrupt:
-                pressed.append(signal.SIGINT)
-            except ValueError as error:
-                print(f"{name} is left out: {error}", file=sys.stderr)
+        results |= _baselines(experiment, pressed)
         errors = None if pressed else measured_values(lambda: pec_errors(experiment, solution))
         with deferred(pressed):
             if pressed:
@@ -106,6 +107,30 @@ def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, si
         seconds=round(seconds, 4),
     )
     return result
+
+
+def _baselines(experiment: PECExperiment, pressed: list[int]) -> dict[str, Result]:
+    """Results of the baselines by name. Each process computes some of them, and the first one receives all."""
+    (rank, count), names = process_count(), experiment.settings.report.baselines
+    results: dict[str, Result] = {}
+    try:
+        for index, name in enumerate(names):
+            mine, unweighted = index % count == rank, name == "unweighted"
+            if pressed or not (mine or unweighted):  # all processes share the solver of the unweighted phases
+                continue
+            try:
+                solve = experiment.unweighted.solve if unweighted else partial(baseline, experiment, name)
+                solution, seconds = timed(solve)
+                if mine:
+                    results[name] = _result(experiment, solution, seconds, single=not unweighted)
+            except ValueError as error:
+                print(f"{name} is left out: {error}", file=sys.stderr)
+        if not pressed:
+            for others in collected(results):
+                results |= others
+    except KeyboardInterrupt:
+        pressed.append(signal.SIGINT)
+    return {name: results[name] for name in names if name in results}
 
 
 def _write_results(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 import platform
 import subprocess
 import sys
@@ -46,13 +47,20 @@ def installed_version(name: str) -> str | None:
 
 
 def find_device(name: str) -> torch.device:
-    """The device for a setting "auto", "cpu" or "cuda". ConfigError if there is no CUDA device for "cuda"."""
+    """The device for a setting "auto", "cpu" or "cuda". ConfigError if there is no CUDA device for "cuda".
+
+    Each process that ``torchrun`` starts on a machine uses a GPU of its own, as far as there are enough.
+    """
     import torch
 
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise ConfigError(["device: cuda was asked for, but torch finds no CUDA device; use device: auto or cpu"])
-    return torch.device("cuda" if name != "cpu" and available else "cpu")
+    if name == "cpu" or not available:
+        return torch.device("cpu")
+    if local_rank := os.environ.get("LOCAL_RANK"):
+        torch.cuda.set_device(int(local_rank) % torch.cuda.device_count())
+    return torch.device("cuda")
 
 
 def _git_state(checkout: Path) -> str | None:
