@@ -102,7 +102,9 @@ def line_errors(
             sizes = tuple(_of_axis(each, axis) for each in samplings)
             key = id(light), grid.pitch[axis], sizes  # equal axes have equal errors
             if key not in known:
-                setup = Grid((1, light.shape[1]), grid.pitch[axis]), wavelength, display, eye, plane, paraxial
+                line = Grid((1, light.shape[1]), grid.pitch[axis])
+                steps = [_pupil_step(each, line, wavelength, display, plane) for each in sizes]
+                setup = line, wavelength, display, _between_samples(eye, max(steps)), plane, paraxial
                 exact = _image(light, _finer(least, axis), *setup)
                 images = [_image(light.to(dtype), each, *setup) for each in sizes]
                 known[key] = exact.square().sum(), torch.stack([(each - exact).square().sum() for each in images])
@@ -124,13 +126,29 @@ def _image(
     paraxial: bool,
 ) -> Tensor:
     """Intensity on the retina of lines [L, n] by the method of ``sampling``, float64."""
-    setup: dict[str, Any] = {"plane": plane, "sampling": sampling, "paraxial": paraxial}
-    if isinstance(sampling, CollapseSampling):
-        return intensity(propagate_collapsed(light[:, None, None], line, wavelength, display, eye, **setup)).double()
-    softness = max(eye.softness, _SOFTNESS * line.pitch[1] / sampling.oversampling[1])
-    eye = replace(eye, softness=softness)
-    with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # wants room for a softer edge
-        return intensity(propagate_elements(light[:, None, None], line, wavelength, display, eye, **setup)).double()
+    setup = light[:, None, None], line, wavelength, display
+    with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # for a pupil a fraction of a sample wider
+        if isinstance(sampling, CollapseSampling):
+            field = propagate_collapsed(*setup, eye, plane=plane, sampling=sampling, paraxial=paraxial)
+        else:
+            eye = replace(eye, softness=max(eye.softness, _SOFTNESS * line.pitch[1] / sampling.oversampling[1]))
+            field = propagate_elements(*setup, eye, plane=plane, sampling=sampling, paraxial=paraxial)
+    return intensity(field).double()
+
+
+def _pupil_step(sampling: Sampling, line: Grid, wavelength: float, display: Display, plane: float) -> float:
+    """Distance in metres between samples of the pupil in the collapse, 0 for elements."""
+    if isinstance(sampling, ElementSampling):
+        return 0.0
+    return wavelength * abs(number(display.matrix(plane)[1])) / (sampling.window[1] * line.pitch[1])
+
+
+def _between_samples(eye: Eye, step: float) -> Eye:
+    """The eye with the edge of its pupil half-way between samples, where their number does not change the brightness.
+
+    Of a disc, whose edge lies anywhere between samples, the changes average out.
+    """
+    return replace(eye, pupil_radius=(math.floor(eye.pupil_radius / step) + 0.5) * step) if step else eye
 
 
 def _of_axis(sampling: Sampling, axis: int) -> Sampling:
