@@ -10,6 +10,7 @@ displacement is weighted by the number of pairs of a source and a pixel with thi
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.special import hankel1e
@@ -111,7 +112,7 @@ def _exact_kernel(axis: Axis, length: int, depth: float) -> np.ndarray:
 
 def faded_out(values: Samples, begin: float, end: float) -> Samples:
     """Smooth step from 1 at abs(values) = ``begin`` to 0 at ``end``, with three continuous derivatives."""
-    t = ((abs(values) - begin) / max(end - begin, 1e-12)).clip(0, 1)
+    t: Any = ((abs(values) - begin) / max(end - begin, 1e-12)).clip(0, 1)
     return 1 - t**4 * (35 - 84 * t + 70 * t**2 - 20 * t**3)
 
 

@@ -7,6 +7,7 @@ two slices that are parallel to the hologram; ``PointReader`` interpolates at ea
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -192,6 +193,10 @@ def occupied_box(occupied: Tensor | None, shape: tuple[int, int, int]) -> tuple[
     return low, high
 
 
+@overload
+def _selected(mask: Tensor, length: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]: ...
+@overload
+def _selected(mask: Tensor, length: float, dtype: torch.dtype) -> tuple[Tensor, Tensor | float]: ...
 def _selected(mask: Tensor, length: Tensor | float, dtype: torch.dtype) -> tuple[Tensor, Tensor | float]:
     """Indices of the rays in ``mask``, bool [n], and the lengths of their paths, of ``length`` [n] or one for all.
 
