@@ -87,6 +87,8 @@ def nearly(value):
     """Nested values whose numbers may differ by rounding."""
     if isinstance(value, dict):
         return {key: nearly(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [nearly(each) for each in value]
     return value if value is None or isinstance(value, str | bool) else pytest.approx(value, rel=1e-4, abs=1e-6)
 
 

@@ -138,8 +138,8 @@ def _draw(measured: list[Measured], link: Link, model: list[dict[str, Any]]) -> 
     left.legend(fontsize=8, loc="lower right")
     for name in dict.fromkeys(row["task"] for row in model):
         own = [row for row in model if row["task"] == name]
-        counts = [row["gpus"] for row in own]
-        right.loglog(counts, [float(row["speedup"]) for row in own], "o--", base=2, label=name)
+        right.loglog([row["gpus"] for row in own], [float(row["speedup"]) for row in own], "o--", base=2, label=name)
+    counts = sorted({row["gpus"] for row in model})
     right.loglog(counts, counts, "k:", linewidth=1, base=2, label="as many times as GPUs")
     right.set_xlabel("GPUs")
     right.set_ylabel("speed over that of one GPU")
