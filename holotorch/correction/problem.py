@@ -10,6 +10,8 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity, phasor
 from holotorch.core.learning import fixed, without_graph
 
+FRAMES_AT_ONCE = 1 << 23  # pixels of all frames above which each is propagated by itself, which then takes no longer
+
 
 class PECProblem(nn.Module):
     """Loss g(X) = || U(X) - I ||^2 with U(X) = | F(exp(i P(X))) |^2, one value per hologram and colour.
@@ -176,13 +178,12 @@ class PECProblem(nn.Module):
         """U, real [..., C, *image], of phases after spreading."""
         if self.frames and spread.ndim < 4:
             raise ValueError(f"phase must end in (F, C, H, W), as frames=True has it, got {tuple(spread.shape)}")
-        try:
-            image = self.propagator(phasor(spread))
-        except ValueError as error:  # of a field of another shape, which is that of the phase that was given
-            if not (message := str(error)).startswith("field must end in"):
-                raise
-            raise ValueError(message.replace("field", "phase", 1)) from None
-        image = intensity(image) if image.is_complex() else image
+        divided = getattr(self.propagator, "divides_frames", False)  # among processes, from all frames at once
+        if self.frames and self.laser is None and spread.numel() > FRAMES_AT_ONCE and not divided:
+            # In turn, since fields and what their transforms need take several times the memory of the phases.
+            images = [self._images(frame).mean(-2 - self.image_axes) for frame in spread.split(1, -4)]
+            return sum(images[1:], images[0]) / len(images)
+        image = self._images(spread)
         if not self.frames:
             return image
         axis = image.ndim - 2 - self.image_axes
@@ -193,6 +194,16 @@ class PECProblem(nn.Module):
             powers = self.laser.to(image.dtype).repeat_interleave(image.shape[axis] // len(self.laser), 0)
             image = image * powers.reshape(*powers.shape, *[1] * self.image_axes)
         return image.mean(axis)
+
+    def _images(self, spread: Tensor) -> Tensor:
+        """Intensities that fields of these phases after spreading form, each by itself."""
+        try:
+            image = self.propagator(phasor(spread))
+        except ValueError as error:  # of a field of another shape, which is that of the phase that was given
+            if not (message := str(error)).startswith("field must end in"):
+                raise
+            raise ValueError(message.replace("field", "phase", 1)) from None
+        return intensity(image) if image.is_complex() else image
 
     def _set_laser(self, laser: Tensor | None) -> None:
         if laser is None:

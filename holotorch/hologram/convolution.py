@@ -1,6 +1,7 @@
 """ConvolutionHologram: exact holograms by one convolution per plane of sources."""
 
 import math
+from bisect import bisect_left
 
 import torch
 from torch import Tensor
@@ -37,7 +38,11 @@ class ConvolutionHologram(LayerHologram):
     def padded(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Size of the transforms in samples for layers of ``shape`` (h, w)."""
         displacement, least = span(self.grid, shape, self.stride)
-        extents = [self._extent(depth, displacement) for depth in self.depths]
+        # The planes that are tapered in frequency are the nearest ones. Among them, and among the others, the farthest
+        # plane has the widest kernel.
+        depths = sorted(self.depths)
+        tapered = bisect_left(depths, True, key=lambda depth: not self._in_frequency(depth, displacement))
+        extents = [self._extent(depth, displacement) for depth in (depths[max(0, tapered - 1)], depths[-1])]
         # No light wraps onto a pixel if the length exceeds the largest displacement plus the half-width of the kernel.
         y, x = (
             strided_length(max(length, samples + max(extent) + 1), self.stride)

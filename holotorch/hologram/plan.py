@@ -150,14 +150,20 @@ def convolution_flops(operator: ConvolutionHologram, shape: tuple[int, int]) -> 
     """Computing time of a convolution of layers of ``shape`` (h, w), as :attr:`HologramPlan.flops`."""
     size, count = operator.padded(shape), len(operator.depths)
     samples, sources = math.prod(size), math.prod(size) / operator.stride**2
-    flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples)
-    return flops + _WAVE * sum(_waves(operator, shape)) + _transform(samples)
+    waves = _waves(operator, shape, size)
+    flops = _transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples + _WAVE * sum(waves) / len(waves)
+    return count * flops + _transform(samples)
 
 
-def _waves(operator: ConvolutionHologram, shape: tuple[int, int]) -> list[int]:
-    """Number of samples of the spherical wave that are computed for each plane."""
-    size = operator.padded(shape)
-    return [math.prod(operator.kernel_samples(depth, shape, size)) for depth in operator.depths]
+def _waves(operator: ConvolutionHologram, shape: tuple[int, int], size: tuple[int, int]) -> list[int]:
+    """Number of samples of the spherical wave of each plane; of at most 1000 planes, the nearest and farthest included.
+
+    ``size`` is that of the transforms.
+    """
+    depths, most = sorted(operator.depths), 1000
+    if (last := len(depths) - 1) >= most:
+        depths = [depths[last * k // (most - 1)] for k in range(most)]
+    return [math.prod(operator.kernel_samples(depth, shape, size)) for depth in depths]
 
 
 def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
@@ -174,7 +180,7 @@ def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: t
         "transforms": count,
         "size": size,
         "predicted_error": error,
-        "memory_bytes": round(dtype.itemsize * (3.3 * samples + sources) + 80 * max(_waves(operator, shape))),
+        "memory_bytes": round(dtype.itemsize * (3.3 * samples + sources) + 80 * max(_waves(operator, shape, size))),
         "flops": convolution_flops(operator, shape),
         "reason": f"{count} planes, each with a transform of its sources and half of one for its wave; exact",
         "operator": operator,

@@ -7,6 +7,7 @@ from oracles import dense, pec
 
 from holotorch import Grid
 from holotorch.correction import PECProblem
+from holotorch.correction import problem as problem_module
 from holotorch.correction.problem import best_scale
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import AngularSpectrum, Fraunhofer, Fresnel
@@ -107,6 +108,24 @@ def test_gradcheck(propagator, scale_free):
     phase = torch.rand(2, 1, *GRID.shape, dtype=torch.float64, requires_grad=True)
     assert problem(phase).shape == (2, 1)
     assert torch.autograd.gradcheck(problem, (phase,), fast_mode=True)
+
+
+@pytest.mark.parametrize("propagator", PROPAGATORS)
+def test_frames_in_turn_give_the_same_loss_and_gradient(propagator, monkeypatch):
+    target = torch.rand(1, *GRID.shape, dtype=torch.float64)
+    fields = []
+    operator = PROPAGATORS[propagator][0]()
+    operator.register_forward_pre_hook(lambda _, given: fields.append(given[0].shape[-4]))
+    problem = PECProblem(ThermalCrosstalk(0.66), operator, target, frames=True, limit=1.0, light_weight=0.1)
+    results = []
+    for at_once in (problem_module.FRAMES_AT_ONCE, 0):
+        monkeypatch.setattr(problem_module, "FRAMES_AT_ONCE", at_once)
+        phase = torch.rand(3, 5, 1, *GRID.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        loss = problem(phase.requires_grad_(True))
+        results.append((loss.detach(), *torch.autograd.grad(loss.sum(), phase)))
+    assert fields == [5] + 5 * [1]
+    for at_once, in_turn in zip(*results, strict=True):
+        assert relative(in_turn, at_once) < 1e-13
 
 
 def test_scale_free_loss_ignores_brightness_and_keeps_its_optimum():

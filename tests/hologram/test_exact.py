@@ -159,6 +159,16 @@ def test_lengths_are_those_of_the_cone_and_no_more():
     assert far == (1024, 1024) and far[0] <= 2 * 512
 
 
+@pytest.mark.parametrize("cone", ["full", "box", "disc", "taper", "band"])
+def test_the_length_is_the_largest_that_a_plane_needs(cone):
+    """Depths in any order, of which some are tapered in frequency, and some are so far that their wave is whole."""
+    grid, depths = Grid((96, 64), (3.74e-6, 4e-6)), [4e-3, 0.3e-3, 31e-3, 9e-3, 8e-3, 1e-3, 120e-3, 16e-3]
+    for count in range(1, len(depths) + 1):
+        alone = [ConvolutionHologram(grid, 520e-9, [each], cone=cone).padded((40, 48)) for each in depths[:count]]
+        largest = tuple(max(lengths) for lengths in zip(*alone, strict=True))
+        assert ConvolutionHologram(grid, 520e-9, depths[:count], cone=cone).padded((40, 48)) == largest
+
+
 def test_direct_counts_its_pairs():
     grid, depths = Grid((9, 8), 4e-6), (20e-6, 5e-3)
     layers = sources(2, 3, 4)

@@ -5,6 +5,7 @@ import torch
 
 from holotorch import Grid
 from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram, plan_hologram
+from holotorch.hologram.plan import convolution_flops
 
 PITCH, WAVE = 3.74e-6, 520e-9
 
@@ -88,3 +89,16 @@ def test_a_cone_that_was_asked_for_is_kept_just_beyond_its_border():
             plan = plan_hologram(grid, WAVE, [part * border], (64, 64), cone=cone, tolerance=1e-3)
             exact = DirectHologram(grid, WAVE, [part * border], cone=cone)(layers)
             assert plan.cone == cone and (plan.operator(layers) - exact).norm() < 1.5e-3 * exact.norm()
+
+
+@pytest.mark.parametrize(("cone", "farthest"), [("box", 6e-3), ("taper", 120e-3)])
+def test_the_cost_of_many_planes_is_foreseen_from_a_thousand(cone, farthest, monkeypatch):
+    """The cost of one plane, summed in a loop, for planes of which the near ones have a narrower cone."""
+    operator = ConvolutionHologram(Grid(64, PITCH), WAVE, depths(3000, 0.2e-3, farthest), cone=cone)
+    size = operator.padded((64, 64))
+    waves = [math.prod(operator.kernel_samples(depth, (64, 64), size)) for depth in operator.depths]
+    assert len(set(waves)) > 1
+    whole = convolution_flops(operator, (64, 64))
+    monkeypatch.setattr(ConvolutionHologram, "kernel_samples", lambda *_: (0, 0))
+    by_waves = whole - convolution_flops(operator, (64, 64))
+    assert by_waves == pytest.approx(150 * sum(waves), rel=2e-3)

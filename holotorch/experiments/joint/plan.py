@@ -13,8 +13,8 @@ from holotorch.experiments.planning.machine import machine_speed, seconds_in_wor
 from holotorch.experiments.volume.plan import dark_picture
 from holotorch.optics.light.coherence import depth_of_focus
 
-_SAMPLE_BYTES = 40  # bytes per padded sample of a view of a frame and colour, kept for the gradient
-_BASE_BYTES = 700e6  # memory of the libraries
+_SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
+_BASE_BYTES = 430e6  # memory of the libraries
 _SPACING = 0.75  # of planes, in depths of focus, above which foci between them are worse (10 dB at 0.94)
 
 

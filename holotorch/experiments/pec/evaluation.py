@@ -20,7 +20,7 @@ class Result:
     """Result of one method, for all C colours of the configuration.
 
     Attributes:
-        phase: Heater phases in rad, [F, C, H, W] for F frames.
+        phase: Heater phases in rad, [F, C, H, W] for F frames, as the solver gives them.
         picture: Intensity at the pixels of the target, scaled to the values of the target, float64 [C, h, w].
         isolated: ``picture`` of a single chip, without periodic repetition; None in the far field.
         numbers: Entry of summary.json for the method.
@@ -34,15 +34,18 @@ class Result:
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
     """First metric of ``report.metrics`` for heater phases [F, C, H, W], mean over the lit colours."""
-    return observed(experiment, phase.double())[1][f"{experiment.settings.report.metrics[0]}_mean"]
+    return observed(experiment, phase, torch.float64)[1][f"{experiment.settings.report.metrics[0]}_mean"]
 
 
-def observed(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any]]:
+def observed(
+    experiment: PECExperiment, phase: Tensor, dtype: torch.dtype | None = None
+) -> tuple[Tensor, dict[str, Any]]:
     """Picture [all colours, h, w] that heater phases [F, C, H, W] form, with the values of the target, and its scores.
 
-    The phases are propagated in their precision. The scores are those of ``report.metrics`` and the efficiency.
+    The phases are propagated in their precision, or in ``dtype``. The scores are those of ``report.metrics`` and the
+    efficiency.
     """
-    formed = experiment.picture_in(experiment.intensity(phase)).cpu()
+    formed = experiment.picture_in(experiment.intensity(phase, dtype)).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
     scores = _scores(experiment, picture, experiment.image)
     return picture, scores | {"efficiency": _efficiency(experiment, formed)}
@@ -53,19 +56,14 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
 
     The scores are those at the image samples, midway between them, and, in the near field, those of a single chip.
     """
-    phase = phase.detach().double()
-    spread = experiment.array.crosstalk(phase)
-    formed = experiment.picture_in(experiment.intensity(phase)).cpu()
+    phase = phase.detach()
+    formed = experiment.picture_in(experiment.intensity(phase, torch.float64)).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
-    warm, driven = experiment.array.temperature(spread), experiment.array.temperature(phase)
     numbers = _scores(experiment, picture, experiment.image) | {
         "frames": len(phase),
         "efficiency": _efficiency(experiment, formed),
         "dark_spots": [int(count) for count in _per_colour(experiment, _spots(experiment, formed))],
-        "peak_phase_rad": spread.max().item(),
-        "peak_temperature_rise_K": _per_colour(experiment, warm.amax((0, -2, -1))),
-        "mean_temperature_rise_K": _per_colour(experiment, warm.mean((0, -2, -1))),
-        "heating_power_K_per_pixel": _per_colour(experiment, driven.mean((0, -2, -1))),
+        **_heating(experiment, phase),
     }
     isolated = None
     if experiment.distances:
@@ -73,8 +71,8 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     else:
         (y, x), (height, width) = experiment.grid.coordinates(phase.device), experiment.grid.extent
         half_a_sample = torch.exp(-1j * math.pi * (y / height + x / width))
-        shifted = [intensity(experiment.propagator(experiment.array(each) * half_a_sample)) for each in phase]
-        between = experiment.picture_in(torch.stack(shifted).mean(0)).cpu()
+        between = experiment.mean_intensity(lambda each: experiment.array(each.double()) * half_a_sample, phase)
+        between = experiment.picture_in(between).cpu()
         if experiment.scale_free:
             between = between * _scale(experiment, formed)
     numbers["between_samples"] = _between_scores(experiment, between)
@@ -83,9 +81,27 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     return Result(_all_colours(experiment, phase.cpu()), picture, isolated, numbers)
 
 
+def _heating(experiment: PECExperiment, phase: Tensor) -> dict[str, Any]:
+    """Peak phase, and peak and mean temperature rises over all frames of heater phases [F, C, H, W]."""
+    array, rows = experiment.array, []
+    for each in phase:  # one frame at a time, to save memory
+        driven = each.double()
+        spread = array.crosstalk(driven)
+        warm = array.temperature(spread)
+        means = warm.mean((-2, -1)), array.temperature(driven).mean((-2, -1))
+        rows.append(torch.stack([spread.amax((-2, -1)), warm.amax((-2, -1)), *means]))
+    frames = torch.stack(rows)  # [F, 4, C]
+    return {
+        "peak_phase_rad": frames[:, 0].max().item(),
+        "peak_temperature_rise_K": _per_colour(experiment, frames[:, 1].amax(0)),
+        "mean_temperature_rise_K": _per_colour(experiment, frames[:, 2].mean(0)),
+        "heating_power_K_per_pixel": _per_colour(experiment, frames[:, 3].mean(0)),
+    }
+
+
 def speckle_spots(experiment: PECExperiment, phase: Tensor) -> Tensor:
     """Number of bright pixels that come out dark for heater phases [F, C, H, W], of each lit colour, [C]."""
-    return _spots(experiment, experiment.picture_in(experiment.intensity(phase.double())).cpu())
+    return _spots(experiment, experiment.picture_in(experiment.intensity(phase, torch.float64)).cpu())
 
 
 def _spots(experiment: PECExperiment, formed: Tensor) -> Tensor:
@@ -111,7 +127,8 @@ def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[st
             for k, offset in enumerate(((0.0, 0.0), (grid.pitch[0] / 2, grid.pitch[1] / 2))):
                 exact = CroppedKernel(grid, wavelength, distance, offset=offset).to(experiment.device)
                 for each in phase:
-                    images[k, i, j] += intensity(exact(experiment.array(each)[i : i + 1]))[0].cpu() / len(phase)
+                    field = experiment.array(each.double())[i : i + 1]
+                    images[k, i, j] += intensity(exact(field))[0].cpu() / len(phase)
     formed, between = experiment.picture_in(images[:, :, 0] if len(experiment.distances) == 1 else images)
     picture = _as_picture(experiment, formed, at_best_scale=True)
     numbers = _scores(experiment, picture, experiment.image)

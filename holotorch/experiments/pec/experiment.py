@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -220,10 +220,15 @@ class PECExperiment:
         propagator = self._intensities if shared and process_count()[1] > 1 else self.propagator
         return PECProblem(self.array.crosstalk, propagator, target, **configured | options)
 
-    def intensity(self, phase: Tensor) -> Tensor:
-        """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W]."""
+    def intensity(self, phase: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+        """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W], by default in their dtype."""
+        return self.mean_intensity(lambda each: self.array(each.to(dtype or each.dtype)), phase)
+
+    def mean_intensity(self, emitted: Callable[[Tensor], Tensor], phase: Tensor) -> Tensor:
+        """Mean intensity [C, *image] of the fields ``emitted`` for each frame of heater phases [F, C, H, W]."""
         # One frame at a time, since float64 fields at several depths take much memory.
-        return torch.stack([intensity(self.propagator(self.array(each))) for each in phase]).mean(0)
+        images = (intensity(self.propagator(emitted(each))) for each in phase)
+        return sum(images, next(images)) / len(phase)
 
     def start_phase(self) -> Tensor:
         """Heater phases at the start, float32 [C, H, W], or [F, C, H, W] for several frames; the same on every device.

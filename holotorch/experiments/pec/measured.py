@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from holotorch.core.complex import intensity, phasor
+from holotorch.core.complex import phasor
 from holotorch.correction import Solution
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import extra_steps_seconds, simulation_seconds
@@ -44,19 +44,18 @@ def pec_errors(experiment: PECExperiment, solution: Solution, limit: float = LIM
 
 def _heat(experiment: PECExperiment, phase: Tensor) -> tuple[float, str]:
     """Error of the kernel's taps, in double precision."""
-    sigma_px, phase = experiment.settings.modulator.sigma_px, phase.double()
+    sigma_px = experiment.settings.modulator.sigma_px
     assert sigma_px is not None
-    spread = spread_completely(sigma_px, phase)
-    formed = torch.stack([intensity(experiment.propagator(phasor(each))) for each in spread]).mean(0)
-    exact = experiment.picture_in(formed)
-    error = scaled_error(experiment.picture_in(experiment.intensity(phase)), exact)
+    complete = experiment.mean_intensity(lambda each: phasor(spread_completely(sigma_px, each.double())), phase)
+    formed = experiment.intensity(phase, torch.float64)
+    error = scaled_error(experiment.picture_in(formed), experiment.picture_in(complete))
     taps = experiment.array.crosstalk.kernel.shape[0]
     return error, f"{taps} taps against {complete_kernel(sigma_px).kernel.shape[0]}, in complex128"
 
 
 def _propagation(experiment: PECExperiment, phase: Tensor) -> tuple[float, str]:
     """Error of the precision of the solver."""
-    exact, solved = (experiment.intensity(phase.to(dtype)) for dtype in (torch.float64, experiment.dtype))
+    exact, solved = (experiment.intensity(phase, dtype) for dtype in (torch.float64, experiment.dtype))
     error = scaled_error(experiment.picture_in(solved), experiment.picture_in(exact))
     return error, f"{experiment.dtype} phases against the same propagation in complex128".removeprefix("torch.")
 

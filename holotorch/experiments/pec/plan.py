@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from holotorch.correction.problem import FRAMES_AT_ONCE
 from holotorch.experiments.pec.budget import stop
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
@@ -14,22 +15,21 @@ from holotorch.experiments.planning.machine import machine_speed, seconds_in_wor
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
-# Memory, right within 30 % with 128 to 1024 px.
-_BASE_BYTES = 450e6  # bytes of the interpreter with its libraries
-_PIXEL_BYTES = 240  # bytes per pixel, colour and frame
-_SOLVER_BYTES = 60  # bytes per padded sample in the solver
-_EVALUATION_BYTES = 112  # bytes per grid sample of one colour in the float64 simulation of the result
+# Memory in bytes, fitted to whole commands (scripts/predictions.py --memory).
+_BASE_BYTES = 430e6  # the interpreter with its libraries, and the report
+_PIXEL_BYTES = {"apg": 70, "adam": 90, "lbfgs": 190}  # in the solver, per pixel of all colours and frames
+_SOLVER_BYTES = 60  # in the solver, per padded sample of the frames that are propagated at once
+_SCORED_BYTES = 350  # in the float64 simulation of the result with its scores, per pixel of all colours of a frame
+_EVALUATION_BYTES = 112  # the same in the near field, per grid sample of one colour besides
+_BASELINE_BYTES = 330  # per pixel of all colours of a frame: the heap of small arrays after the methods of comparison
+_MAPPED = 32e6  # bytes above which an array is not in the heap, but returned to the system at once
 
 
 def plan_values(experiment: PECExperiment) -> dict[str, Any]:
     """Values of plan.json: choices with their reasons, predicted cost, and physics of the setup."""
     settings, grid = experiment.settings, experiment.grid
-    padded, channels = grid.padded(2 if experiment.isolated else 1), len(experiment.wavelengths) * settings.frames
-    pixels, samples = channels * math.prod(grid.shape), channels * padded_samples(experiment)
+    padded = grid.padded(2 if experiment.isolated else 1)
     seconds = seconds_of(experiment, machine_speed(experiment.device))
-    solver_bytes, evaluation_bytes = _SOLVER_BYTES * samples, 0
-    if experiment.distances:
-        evaluation_bytes = 16 * samples + _EVALUATION_BYTES * 5 * math.prod(grid.shape)
     single = {}
     if experiment.isolated:
         propagation = plan_propagation(grid, experiment.wavelengths, list(experiment.distances))
@@ -63,10 +63,26 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
         "predicted_evaluations": evaluations(experiment),
         "predicted_seconds": round(sum(seconds.values()), 2),
         "seconds_of": {name: round(each, 2) for name, each in seconds.items()},
-        "predicted_peak_bytes": round(_BASE_BYTES + _PIXEL_BYTES * pixels + max(solver_bytes, evaluation_bytes)),
+        "predicted_peak_bytes": round(_peak_bytes(experiment)),
         "physics": _physics(experiment),
         "notes": _notes(experiment),
     }
+
+
+def _peak_bytes(experiment: PECExperiment) -> float:
+    """Peak memory of a run, which does not depend on the number of steps."""
+    settings, frames = experiment.settings, experiment.settings.frames
+    colours, samples = len(experiment.wavelengths), math.prod(experiment.grid.shape)
+    frame, padded = colours * samples, colours * padded_samples(experiment)
+    at_once = frames if frames * frame <= FRAMES_AT_ONCE or not experiment.joint else 1
+    double = experiment.dtype.itemsize / 4
+    solver = double * (_PIXEL_BYTES[settings.solver.kind] * frames * frame + _SOLVER_BYTES * at_once * padded)
+    images = frame * max(1, (1 + len(experiment.distances)) // 2)
+    scored = _SCORED_BYTES * images
+    if experiment.distances:
+        scored += 16 * padded + _EVALUATION_BYTES * 5 * samples
+    heap = _BASELINE_BYTES * images if settings.report.baselines and 8 * frame < _MAPPED else 0
+    return _BASE_BYTES + max(solver, scored) + heap
 
 
 def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:

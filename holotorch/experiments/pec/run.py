@@ -150,7 +150,7 @@ def _write_results(
     names = [f"{wavelength * 1e9:.0f} nm" for wavelength in experiment.wavelengths]
     frames = len(corrected.phase)
     maps = [f"{name}, frame 1 of {frames}" for name in names] if frames > 1 else names
-    phase = corrected.phase[0][experiment.lit].to(experiment.device)
+    phase = corrected.phase[0][experiment.lit].to(experiment.device).double()
     warm = experiment.array.temperature(experiment.array.crosstalk(phase)).cpu()
     losses = solution.losses.reshape(len(solution.losses), -1, len(names)).mean(1)  # mean over independent frames
     drawn = {

@@ -106,6 +106,8 @@ class SharedIntensity(nn.Module):
     processors of different types.
     """
 
+    divides_frames = True
+
     def __init__(self, make: Callable[[Sequence[int]], nn.Module], colours: int, frames: int):
         super().__init__()
         self.frames, self.colours = share(frames, colours, *process_count())

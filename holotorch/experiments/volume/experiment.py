@@ -38,6 +38,7 @@ HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the toleranc
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
 _PRIMARIES = 450e-9, 530e-9, 630e-9  # metres: wavelengths of a volume's blue, green and red, for more than three
+_QUICK_PLANES = 1000  # planes of a quick rendering at most; as many slabs as voxels along the depth are thin enough
 # Shares of red, green and blue that each wavelength shows, longest first, for fewer wavelengths than colours.
 _SHOWN = {1: ((1 / 3, 1 / 3, 1 / 3),), 2: ((0.5, 0.5, 0.0), (0.0, 0.5, 0.5))}
 
@@ -193,14 +194,17 @@ class VolumeExperiment:
         return picture[: len(self.settings.wavelengths)].cpu(), opacity.cpu()
 
     def quick_rendering(self, side: int, *, lit: bool = True) -> Tensor:
-        """The same picture on at most ``side`` rays along each side, without lighting and scattering unless ``lit``."""
+        """The same picture on at most ``side`` rays along each side, without lighting and scattering unless ``lit``.
+
+        Of more than a thousand planes, neighbours are joined to one in their middle, whose slab is as thick as theirs.
+        """
         rays = self.rays
         step = max(1, -(-max(rays.shape) // side))
         height, width = (max(1, n // step) for n in rays.shape)
         sampler = DVRSampler(
             self.transfer,
             Grid((height, width), (rays.pitch[0] * step, rays.pitch[1] * step)),
-            self.depths,
+            _joined(self.depths, _QUICK_PLANES),
             width=self.width,
             distance=self.distance,
             rotation=self.rotation,
@@ -258,6 +262,15 @@ class VolumeExperiment:
     def refocus(self) -> list[float]:
         """Configured depths of the refocused pictures, in metres; empty if there are none."""
         return [depth / self.settings.scale for depth in self.settings.report.refocus or ()]
+
+
+def _joined(depths: Sequence[float], most: int) -> Sequence[float]:
+    """``depths`` if they are at most ``most``; otherwise the means of that many groups of neighbours."""
+    count = len(depths)
+    if count <= most:
+        return depths
+    groups = (depths[count * k // most : count * (k + 1) // most] for k in range(most))
+    return [sum(group) / len(group) for group in groups]
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,13 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import figures
+from holotorch.experiments.volume import experiment as volume_experiment
 from holotorch.experiments.volume import run as volume_run
 from holotorch.experiments.volume.evaluation import pooled
 from holotorch.experiments.volume.experiment import Part, build
-from holotorch.experiments.volume.plan import plan_text, plan_values
+from holotorch.experiments.volume.plan import dark_picture, plan_text, plan_values
 from holotorch.hologram import ConvolutionHologram
+from holotorch.scene.march import March
 
 CONFIGS = paths.CONFIGS / "volume"
 TINY = [
@@ -253,6 +255,31 @@ def test_a_scene_within_the_depth_of_focus_is_noted():
     assert note.startswith("the scene is 0.2 mm deep and the depth of focus 0.49") and "wider hologram" in note
     deep = settings("hologram.depths=[2 mm, 4 mm]")
     assert not any("depth of focus" in note for note in plan_values(build(deep))["warnings"])
+
+
+@pytest.mark.parametrize("name", ["tooth", "c60", "teapot", "engine", "hand", "bonsai"])
+def test_joined_planes_are_as_dark_as_all_of_them(name, monkeypatch):
+    """The joined slabs keep their opacity per metre; with all of it in one slab the picture would be another."""
+    config = load_config(CONFIGS / f"{name}.yaml", ["volume={phantom: shells, samples: 24}", "hologram.depths=192"])
+    pictures, warnings = [], []
+    for most in (1000, 64):
+        monkeypatch.setattr(volume_experiment, "_QUICK_PLANES", most)
+        experiment = build(config)
+        pictures.append(experiment.quick_rendering(64, lit=False))
+        warnings.append(dark_picture(experiment))
+    assert warnings[0] == warnings[1]
+    assert (pictures[0] - pictures[1]).norm() < 0.05 * pictures[0].norm()  # slabs of up to half a voxel
+    monkeypatch.setattr(volume_experiment, "_QUICK_PLANES", 3)
+    assert (build(config).quick_rendering(64, lit=False) - pictures[0]).norm() > 0.1 * pictures[0].norm()
+
+
+def test_a_check_of_many_planes_renders_few(monkeypatch, capsys):
+    counts, picture = [], March.picture
+    monkeypatch.setattr(March, "picture", lambda march, *wanted: counts.append(len(march.spans)) or picture(march))
+    words = [*TINY, "hologram.shape=[64, 64]", "hologram.depths=65535"]
+    assert main(["check", str(CONFIGS / "tooth.yaml"), *words]) == 0
+    assert "65535 planes from" in capsys.readouterr().out
+    assert 1000 in counts and sum(counts) < 6000
 
 
 def test_cells_around_rays_do_not_wrap():
