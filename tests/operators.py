@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -60,7 +60,6 @@ class Case:
             phase k z of up to 2.4e4 rad, 2.4e4 * 1e-16, with a margin.
         unitary: Whether the adjoint is the inverse.
         refusal: Message for an input whose last axis is one sample short; None for operators that take any size.
-        broken: Contracts that the operator does not keep, by name, each with the reason.
     """
 
     name: str
@@ -73,7 +72,6 @@ class Case:
     tolerance: float = 1e-11
     unitary: bool = False
     refusal: str | None = r"field must end in \(C, H, W\) = \(2, 12, 17\), got \(2, 12, 16\)"
-    broken: dict[str, str] = field(default_factory=dict)
 
     def input(self, *batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
         """Gaussian noise of the input's shape; ``dtype`` is that of the real part."""
@@ -196,12 +194,6 @@ UNEVEN = (0.21e-3, 0.26e-3, 0.29e-3)  # depths in metres; the cones of light are
 EVEN = (0.21e-3, 0.25e-3, 0.29e-3)
 
 
-WITHOUT_LIGHT = {
-    DirectHologram: "rows without light are skipped, which depends on the values of the layers",
-    AxialHologram: "the weights of the nodes are NumPy arrays",
-}
-
-
 def _hologram(kind: type, cone: str, error: float, stride: int = 1, depths=UNEVEN, **options) -> Case:
     grid, wavelength = GRID, WAVELENGTHS[0]
     layer = (-(-GRID.shape[0] // stride), -(-GRID.shape[1] // stride))
@@ -214,7 +206,6 @@ def _hologram(kind: type, cone: str, error: float, stride: int = 1, depths=UNEVE
         channels=(),
         tolerance=error,
         refusal=None,
-        broken={} if kind is ConvolutionHologram else {"compile": WITHOUT_LIGHT[kind]},
     )
 
 

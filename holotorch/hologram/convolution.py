@@ -1,7 +1,6 @@
 """ConvolutionHologram: exact holograms by one convolution per plane of sources."""
 
 import math
-from bisect import bisect_left
 
 import torch
 from torch import Tensor
@@ -41,7 +40,13 @@ class ConvolutionHologram(LayerHologram):
         # The planes that are tapered in frequency are the nearest ones. Among them, and among the others, the farthest
         # plane has the widest kernel.
         depths = sorted(self.depths)
-        tapered = bisect_left(depths, True, key=lambda depth: not self._in_frequency(depth, displacement))
+        tapered, others = 0, len(depths)
+        while tapered < others:  # bisection; that of the standard library cannot be compiled
+            middle = (tapered + others) // 2
+            if self._in_frequency(depths[middle], displacement):
+                tapered = middle + 1
+            else:
+                others = middle
         extents = [self._extent(depth, displacement) for depth in (depths[max(0, tapered - 1)], depths[-1])]
         # No light wraps onto a pixel if the length exceeds the largest displacement plus the half-width of the kernel.
         y, x = (

@@ -12,7 +12,6 @@ from functools import lru_cache
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import wofz
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -136,6 +135,8 @@ def _taps_and_slopes(index: Array, a: Array) -> Array:
     integral up to u >= 0 is (1 - i)/2 (1 - exp(-i pi u^2 / 2) w), with the Faddeeva function w of (i - 1) sqrt(pi)/2 u
     (Abramowitz and Stegun 7.3.22 and 7.1.3).
     """
+    from scipy.special import wofz  # here, since importing it changes the filters of warnings
+
     scale = np.sqrt(2 * a)
     curvature = np.square(index) / a
     chirp, end = _turns(curvature / 2), _turns(-a / 8) * (1 - 2 * (index % 2))

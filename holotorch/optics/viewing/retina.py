@@ -73,7 +73,7 @@ def plan_retina(
 ) -> RetinaPlan:
     """Choose between :func:`propagate_collapsed` and :func:`propagate_elements`.
 
-    The errors are those of lines of light (:mod:`holotorch.optics.viewing.line_errors`): by default of noise that fills
+    The errors are those of lines of light (``optics.viewing.line_errors``): by default of noise that fills
     window and band of the hologram, in expectation, and of rows and columns of ``example`` if it is given. Errors with
     an example are within a factor 3 of those in two dimensions for noise, pictures, holograms, points and beams
     (tests/optics/viewing/test_line_errors.py). Without an example that holds for light that is speckled all over the
@@ -95,7 +95,7 @@ def plan_retina(
         paraxial: Predict errors in the Fresnel model, in which the eyepiece's edge and the sampling are the only errors
             of the collapse.
         registered: Do not count as an error that parts of the image move by a fraction of a spot. The error of oblique
-            paths is then that of points within ``reach``, by default within the hologram (:func:`collapse_error`).
+            paths is then that of points within ``reach``, by default within the hologram (``collapse_error``).
         example: A field [..., C, H, W] like those to be propagated, which takes the place of noise.
         dtype: Type of the field, complex64 or complex128.
         memory_limit: Exclude a method that needs more bytes than this for one image of one wavelength.

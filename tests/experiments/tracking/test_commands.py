@@ -269,7 +269,7 @@ def test_stream_check_on_a_free_port_and_on_one_in_use(capsys):
     assert status == (1 if any(line.startswith("FAIL") for line in lines) else 0)
     assert lines[0].startswith("OK    port")
     assert sum(line.startswith("OK    receiver") and "150 of 150 packets" in line for line in lines) == 2
-    assert sum(line.startswith("OK    lossy way") for line in lines) == 1
+    assert sum(line.startswith("OK    lossy path") for line in lines) == 1
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("", 0))
         assert main(["stream", "--check", "--packets", "100", "--port", str(one.getsockname()[1])]) == 1
