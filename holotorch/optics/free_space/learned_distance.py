@@ -8,10 +8,10 @@ determines them, and their gradient is never computed for each sample.
 import math
 from collections.abc import Callable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -23,7 +23,7 @@ from holotorch.optics.free_space.plane_pair import PlanePair
 _REMEMBERED = 1 << 22  # largest number of samples of a remembered factor of the phase; 32 MB
 _NEAREST = 1.0  # least wavelength times distance, in squared pitches; below it the closed form loses digits
 
-Array = NDArray[np.generic]
+Array = np.ndarray[Any, np.dtype[Any]]
 Differentiable = Callable[[Tensor, Tensor], Tensor]  # from wavelength and distance to the transfer function
 
 
