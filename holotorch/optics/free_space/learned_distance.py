@@ -74,40 +74,32 @@ class _TimesLearned(torch.autograd.Function):
         lines = factors[0] * _turns(z / wavelengths)[:, None]
         lines[1] += 2j * math.pi / wavelengths[:, None] * lines[0]  # the derivative of the carrier
         columns = torch.from_numpy(lines).to(spectrum.dtype)
-        quadrant = columns[0, :, :, None] * rows[0, :, None, :]
-        beyond = None
+        quadrants = columns[:, :, :, None] * rows[0, :, None, :]  # of the function and of its derivative
+        quadrants[1].addcmul_(columns[0, :, :, None], rows[1, :, None, :])
         if not paraxial:
-            beyond = _phasor(z * _cycles_per_metre(padded, tuple(wavelengths.tolist())), spectrum.dtype)
-            quadrant *= beyond
-        kernel = _mirrored(_mirrored(quadrant, padded.shape[1], -1), padded.shape[0], -2)
+            cycles = _cycles_per_metre(padded, tuple(wavelengths.tolist()))
+            quadrants[1].add_(quadrants[0] * cycles.to(quadrants.real.dtype), alpha=2j * math.pi)
+            quadrants *= _phasor(z * cycles, spectrum.dtype)
+        kernels = _mirrored(_mirrored(quadrants, padded.shape[1], -1), padded.shape[0], -2)
         ones = [1] * (distance.ndim - wavelength.ndim)  # torch.broadcast_shapes takes 8 us
-        kernel = kernel.reshape(*ones, *wavelength.shape, *padded.shape)
-        ctx.save_for_backward(spectrum, kernel, distance, wavelength, columns, rows, beyond)
-        ctx.padded, ctx.differentiable = padded, differentiable
-        return spectrum * kernel
+        kernel, slope = kernels.reshape(2, *ones, *wavelength.shape, *padded.shape)
+        product = spectrum * kernel
+        ctx.save_for_backward(spectrum, kernel.conj_physical_(), spectrum * slope, distance, wavelength)
+        ctx.differentiable = differentiable
+        return product
 
     @staticmethod
     def backward(ctx, *grad_outputs):
-        spectrum, kernel, distance, wavelength, columns, rows, beyond = ctx.saved_tensors
+        spectrum, conjugate, slope, distance, wavelength = ctx.saved_tensors
         (grad,) = grad_outputs
         if torch.is_grad_enabled():  # a second derivative may follow
             product = spectrum * ctx.differentiable(wavelength, distance)
             inputs = [each for each, needed in zip((spectrum, distance), ctx.needs_input_grad, strict=False) if needed]
             slopes = iter(torch.autograd.grad(product, inputs, grad, create_graph=True))
             return *[next(slopes) if needed else None for needed in ctx.needs_input_grad[:2]], *[None] * 5
-        to_spectrum = (grad * kernel.conj()).sum_to_size(spectrum.shape) if ctx.needs_input_grad[0] else None
-        shape = len(wavelength.reshape(-1)), *ctx.padded.shape
-        folded = _folded(_folded((grad.conj() * spectrum).sum_to_size(kernel.shape).reshape(shape), -2), -1)
-        if beyond is not None:
-            folded = folded * beyond
-        # The sum over one axis with its factor and with the derivative of that, [C, h, 2], then over the other axis.
-        sums = folded @ rows.movedim(0, -1)
-        total = (columns.movedim(0, -1) * sums.flip(-1)).sum()
-        if beyond is not None:
-            factor = _cycles_per_metre(ctx.padded, tuple(wavelength.reshape(-1).tolist())).to(folded.real.dtype)
-            curved = (folded * factor) @ rows[0, :, :, None]
-            total = total + 2j * math.pi * (columns[0, :, :, None] * curved).sum()
-        return to_spectrum, total.real.to(distance.dtype).reshape(distance.shape), *[None] * 5
+        to_spectrum = (grad * conjugate).sum_to_size(spectrum.shape) if ctx.needs_input_grad[0] else None
+        total = torch.vdot(grad.reshape(-1), slope.reshape(-1)).real
+        return to_spectrum, total.to(distance.dtype).reshape(distance.shape), *[None] * 5
 
 
 def _axis_factor(size: int, pitch: float, sampled: bool, wavelength: Array, distance: float) -> Array:
@@ -179,15 +171,3 @@ def _phasor(cycles: Tensor, dtype: torch.dtype) -> Tensor:
 def _mirrored(half: Tensor, size: int, axis: int) -> Tensor:
     """The even sequence of ``size`` samples, in FFT order, whose samples 0 to size // 2 along ``axis`` are given."""
     return torch.cat([half, half.narrow(axis, 1, (size - 1) // 2).flip(axis)], axis)
-
-
-def _folded(whole: Tensor, axis: int) -> Tensor:
-    """Adjoint of :func:`_mirrored`: the second half of the samples along ``axis`` is added to its mirror images.
-
-    The first half of ``whole`` is overwritten.
-    """
-    size = whole.shape[axis]
-    mirrored = (size - 1) // 2
-    half = whole.narrow(axis, 0, size // 2 + 1)
-    half.narrow(axis, 1, mirrored).add_(whole.narrow(axis, size // 2 + 1, mirrored).flip(axis))
-    return half
