@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from holotorch.core import checks
+from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.padding import FINEST
 from holotorch.optics.free_space.plane_pair import PlanePair
@@ -80,11 +81,10 @@ class _TimesLearned(torch.autograd.Function):
             cycles = _cycles_per_metre(padded, tuple(wavelengths.tolist()))
             quadrants[1].add_(quadrants[0] * cycles.to(quadrants.real.dtype), alpha=2j * math.pi)
             quadrants *= _phasor(z * cycles, spectrum.dtype)
-        kernels = _mirrored(_mirrored(quadrants, padded.shape[1], -1), padded.shape[0], -2)
-        ones = [1] * (distance.ndim - wavelength.ndim)  # torch.broadcast_shapes takes 8 us
-        kernel, slope = kernels.reshape(2, *ones, *wavelength.shape, *padded.shape)
-        product = spectrum * kernel
-        ctx.save_for_backward(spectrum, kernel.conj_physical_(), spectrum * slope, distance, wavelength)
+        ones = [1] * (distance.ndim - wavelength.ndim)
+        kernel, slope = quadrants.reshape(2, *ones, *wavelength.shape, *quadrants.shape[-2:])
+        product = _times_even(spectrum, kernel)
+        ctx.save_for_backward(spectrum, kernel.conj_physical_(), _times_even(spectrum, slope), distance, wavelength)
         ctx.differentiable = differentiable
         return product
 
@@ -97,7 +97,7 @@ class _TimesLearned(torch.autograd.Function):
             inputs = [each for each, needed in zip((spectrum, distance), ctx.needs_input_grad, strict=False) if needed]
             slopes = iter(torch.autograd.grad(product, inputs, grad, create_graph=True))
             return *[next(slopes) if needed else None for needed in ctx.needs_input_grad[:2]], *[None] * 5
-        to_spectrum = (grad * conjugate).sum_to_size(spectrum.shape) if ctx.needs_input_grad[0] else None
+        to_spectrum = _times_even(grad, conjugate).sum_to_size(spectrum.shape) if ctx.needs_input_grad[0] else None
         total = torch.vdot(grad.reshape(-1), slope.reshape(-1)).real
         return to_spectrum, total.to(distance.dtype).reshape(distance.shape), *[None] * 5
 
@@ -168,6 +168,13 @@ def _phasor(cycles: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.complex(angle.cos(), angle.sin())
 
 
-def _mirrored(half: Tensor, size: int, axis: int) -> Tensor:
-    """The even sequence of ``size`` samples, in FFT order, whose samples 0 to size // 2 along ``axis`` are given."""
-    return torch.cat([half, half.narrow(axis, 1, (size - 1) // 2).flip(axis)], axis)
+def _times_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
+    """``spectrum`` [..., H, W] times the even array of which ``quadrant`` [..., H // 2 + 1, W // 2 + 1] is a part.
+
+    The whole array is never made: new memory takes longer than the product.
+    """
+    leading = quadrant.shape[:-2]
+    if spectrum.shape[max(0, spectrum.ndim - 2 - len(leading)) : -2] != leading:  # torch.broadcast_shapes takes 8 us
+        shape = torch.broadcast_shapes(spectrum.shape[:-2], leading)
+        spectrum = spectrum.expand(*shape, *spectrum.shape[-2:])
+    return multiply_even(spectrum.clone(memory_format=torch.contiguous_format), quadrant)
