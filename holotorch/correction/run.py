@@ -253,6 +253,7 @@ class Solver:
         """
         run = Run(self, objective, start, project, resume)
         extra = {name: run.resumed.get(name, value) for name, value in self._begin(run).items()}
+        del run.gradient  # a step that needs it holds it in ``extra``
         while run.step < self.max_steps and (run.active.any() if run.going is None else run.going):
             extra = self._advance(run, **extra)
             if callback:
