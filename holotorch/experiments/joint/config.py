@@ -164,7 +164,9 @@ def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
         problems.append((("display", "pitch"), f"expected {least}, got {min(display.pitch):g} m"))
     planes = display.planes or (PLANES if settings.tolerance is None else 1)
     if "slabs" in settings.report.baselines and settings.frames < planes:
-        hint = f"slabs shows one plane a frame and needs at least {planes} frames, got {settings.frames}"
         others = ", ".join(name for name in settings.report.baselines if name != "slabs")
-        problems.append((("report", "baselines"), f"{hint}; leave it out: 'report.baselines=[{others}]'"))
+        cure = f"use {planes} frames, or leave it out: 'report.baselines=[{others}]'"
+        chosen = "baselines" in settings.report.model_fields_set
+        words = f"the comparison 'slabs' shows one plane a frame, here {planes} planes, got {settings.frames} frames"
+        problems.append((("report", "baselines") if chosen else ("frames",), f"{words}; {cure}"))
     return problems

@@ -43,6 +43,7 @@ class RetinaPlan:
         runner_up: Error and cost of the other method, or why it is impossible, in words.
         adequate: Whether ``predicted_error`` is within the tolerance.
         cost_ratio: ``flops`` relative to those of the cheapest usable method.
+        cheapest_error: ``predicted_error`` of that method.
     """
 
     method: str
@@ -54,6 +55,7 @@ class RetinaPlan:
     runner_up: str
     adequate: bool
     cost_ratio: float = 1.0
+    cheapest_error: float = 0.0
 
 
 def plan_retina(
@@ -120,7 +122,8 @@ def plan_retina(
         f"{best.flops:.2g} operations, {best.memory_bytes:.2g} bytes"
     )
     runner_up = next((each.reason for each in options if each is not best), impossible)
-    return replace(best, reason=reason, runner_up=runner_up, cost_ratio=best.flops / cheapest.flops)
+    ratio, error = best.flops / cheapest.flops, cheapest.predicted_error
+    return replace(best, reason=reason, runner_up=runner_up, cost_ratio=ratio, cheapest_error=error)
 
 
 def _options(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from paths import CONFIGS
+from tiny_runs import EYE
 
 from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
@@ -210,6 +211,24 @@ def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
     assert error < sum(way.predicted_error for way in ways)
     predicted = [plan_values(found)["seconds_of"]["pictures"] for found in (short, long)]
     assert predicted[1] > 2 * predicted[0]
+
+
+@pytest.mark.parametrize(("tolerance", "hinted"), [(0.02, True), (0.01, False), (0.04, False)])
+def test_a_cheaper_method_that_nearly_meets_the_tolerance_is_pointed_out(tolerance, hinted):
+    words = [*EYE, "seeds=1", "light={sources: [laser]}", "focus=[2 mm]"]
+
+    def plan(*more: str) -> tuple[dict, str]:
+        eye = observer(load_config(CONFIGS / "eye" / "teapot.yaml", [*words, *more]))
+        values = plan_values(eye)
+        return values["retina"][0], plan_text(eye, values)
+
+    chosen, text = plan(f"eye.tolerance={tolerance}")
+    [*hints] = [line.split() for line in text.splitlines() if line.startswith("Hint")]
+    assert len(hints) == hinted
+    if hinted:
+        cheaper, _ = plan(hints[0][1])
+        assert chosen["method"] == "elements" and cheaper["method"] == "collapse"
+        assert cheaper["predicted_error"] == chosen["cheapest_error"] < 2 * tolerance
 
 
 def test_a_way_that_does_not_fit_is_refused_before_it_starts(capsys, monkeypatch):

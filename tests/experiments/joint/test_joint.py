@@ -175,7 +175,8 @@ def test_a_focus_at_the_array_is_taken_and_a_plane_behind_it_is_not():
     ("words", "message"),
     [
         (["display.depth=13 mm"], "less than twice the distance, 0.012 m"),
-        (["frames=2", "report.baselines=[slabs]"], "needs at least 4 frames, got 2"),
+        (["frames=2", "report.baselines=[slabs]"], "report.baselines: the comparison 'slabs' shows one plane a frame"),
+        (["frames=2"], "frames: the comparison 'slabs' shows one plane a frame, here 4 planes, got 2 frames; use 4"),
         (["wavelengths=[]"], "expected 1 (grey), 3 (red, green, blue) or another number, got 0"),
         (["display.pitch=0.4 um"], "at least 0.9 of the longest wavelength"),
         (["display.distance=0.1 mm", "display.depth=null"], "display.distance: expected the whole volume in front"),
