@@ -218,7 +218,8 @@ def test_a_cheaper_method_that_nearly_meets_the_tolerance_is_pointed_out(toleran
     words = [*EYE, "seeds=1", "light={sources: [laser]}", "focus=[2 mm]"]
 
     def plan(*more: str) -> tuple[dict, str]:
-        eye = observer(load_config(CONFIGS / "eye" / "teapot.yaml", [*words, *more]))
+        settings = load_config(CONFIGS / "eye" / "teapot.yaml", [*words, *more])
+        eye = observer(settings, scene_settings(settings))
         values = plan_values(eye)
         return values["retina"][0], plan_text(eye, values)
 
