@@ -41,7 +41,8 @@ def test_check_computes_and_writes_nothing(capsys, tmp_path):
 
 HEAT = "Heat       "
 NO_LIMIT = HEAT + "no limit, as in the thesis: the hottest pixel is reported"
-FOUR_PI = HEAT + "the phase after spreading stays below 12.57 rad, 700 / 589 / 494 degC above ambient"
+SHARED = "700 / 589 / 494 degC above ambient of the colours, which share this limit"
+FOUR_PI = f"{HEAT}the phase after spreading stays below 12.57 rad, {SHARED}"
 FRAMES = "Frames     4, shown in turn and solved for {}; the eye sees their mean"
 
 

@@ -83,7 +83,8 @@ class ModulatorSettings(Settings):
     temperature rises around one heated pixel, which is the warmest and in the middle, in any unit. ``kernel_size``:
     taps of the kernel along each axis, by default as many as its width needs. ``max_phase``: upper limit on the phase
     of every pixel after the heat has spread, such as 4pi (700 degC at 630 nm); no limit by default, as in the thesis.
-    ``max_temperature``: in its place a limit on the temperature of every pixel above ambient, such as 500 degC.
+    ``max_temperature``: in its place a limit on the temperature of every pixel above ambient, such as 500 degC. All
+    colours have one limit in phase, so that only the one with the smallest phase per kelvin gets as warm.
     ``rad_per_K``: phase per kelvin at 630 nm, by default that of the thesis, pi / 175 K; other wavelengths in inverse
     proportion. ``bits``: resolution of the heaters, whose levels
     are evenly spaced from 0 to the largest phase. ``power_weight``: weight of the sum of the heater phases in the loss.

@@ -187,7 +187,8 @@ def _heat(experiment: PECExperiment) -> str:
     if limit is None:
         return "no limit, as in the thesis: the hottest pixel is reported" + steps
     kelvin = [limit / response for response in experiment.array.response]
-    return f"the phase after spreading stays below {limit:.4g} rad, {_listed(kelvin)} degC above ambient" + steps
+    which = "" if len(kelvin) == 1 else " of the colours, which share this limit"
+    return f"the phase after spreading stays below {limit:.4g} rad, {_listed(kelvin)} degC above ambient{which}" + steps
 
 
 def _padding_reason(experiment: PECExperiment) -> str:

@@ -201,8 +201,8 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
         problems.append((("wavelengths",), "expected wavelengths that all differ"))
     side, rays = hologram.shape, hologram.rays
     if rays is not None and (side[0] % rays or side[1] % rays or side[0] // rays != side[1] // rays):
-        message = f"expected a number that divides the hologram's sides {side}, got {rays}"
-        problems.append((("hologram", "rays"), message))
+        message = f"expected a number that divides the hologram's sides {side}, both equally often, got {rays}"
+        problems.append((("hologram", "rays"), f"{message}; 'hologram.rays=null' is one ray per pixel"))
     if settings.view.lighting and settings.view.scattering:
         problems.append((("view", "lighting"), "expected false with scattering, which takes its place"))
     if settings.view.scattering and not any(settings.view.scattering.towards):

@@ -214,6 +214,12 @@ def dark_picture(experiment: VolumeExperiment) -> list[str]:
     share = (experiment.quick_rendering(_COARSE, lit=False).amax(0) > _LIT).double().mean().item()
     if share >= _DARK:
         return []
+    low, highest = experiment.settings.transfer.low, float(experiment.volume.values.max())
+    if low is not None and low >= highest:
+        return [
+            f"transfer.low {low:g} is not below the largest value of the file, {highest:g}: nothing is visible; leave low "
+            "and high out, and the preset takes them from the histogram"
+        ]
     return [
         f"{100 * (1 - share):.0f} % of the picture is black: SSIM, which compares black with black there, says little; "
         "look at holotorch check --preview, and change transfer or view.width"

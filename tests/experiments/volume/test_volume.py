@@ -183,6 +183,14 @@ def test_a_file_is_read_and_a_broken_one_named(tmp_path):
         build(settings(f"volume={{path: {tmp_path / 'nan.npy'}, spacing: 1, unit: relative}}"))
 
 
+def test_a_range_above_all_values_is_named(tmp_path):
+    values = np.linspace(0, 254, 64, dtype=np.uint8).reshape(4, 4, 4)
+    np.save(tmp_path / "eight_bit.npy", values)
+    own = f"volume={{path: {tmp_path / 'eight_bit.npy'}, spacing: 1, unit: relative}}"
+    warnings = plan_values(build(settings(own, "transfer={preset: bone, low: 900, high: 1800}")))["warnings"]
+    assert any(w.startswith("transfer.low 900 is not below the largest value of the file, 254") for w in warnings)
+
+
 def test_an_empty_volume_is_black_and_said_to_be(tmp_path, capsys):
     np.save(tmp_path / "empty.npy", np.zeros((4, 4, 4), np.uint8))
     folder, _ = execute(
@@ -201,6 +209,7 @@ def test_an_empty_volume_is_black_and_said_to_be(tmp_path, capsys):
         ("hologram.distance=50 um", "hologram.distance: expected the whole volume in front of the hologram"),
         ("hologram.distance=-3 mm", "hologram.distance: expected a distance above zero"),
         ("hologram.rays=33", "hologram.rays: expected a number that divides the hologram's sides"),
+        ("hologram.rays=7", "got 7; 'hologram.rays=null' is one ray per pixel"),
         ("volume={}", "volume: expected a path, a scene or a phantom"),
         ("volume={path: no/such.nrrd}", "volume.path: expected a file or folder that exists, got 'no/such.nrrd'"),
         ("volume={scene: tooht}", "did you mean 'tooth'"),
