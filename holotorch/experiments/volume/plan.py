@@ -217,8 +217,8 @@ def dark_picture(experiment: VolumeExperiment) -> list[str]:
     low, highest = experiment.settings.transfer.low, float(experiment.volume.values.max())
     if low is not None and low >= highest:
         return [
-            f"transfer.low {low:g} is not below the largest value of the file, {highest:g}: nothing is visible; leave low "
-            "and high out, and the preset takes them from the histogram"
+            f"transfer.low {low:g} is not below the largest value of the file, {highest:g}: nothing is visible; leave "
+            "low and high out, and the preset takes them from the histogram"
         ]
     return [
         f"{100 * (1 - share):.0f} % of the picture is black: SSIM, which compares black with black there, says little; "
