@@ -84,7 +84,14 @@ def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str)
         if advice := getattr(section, "elsewhere", {}).get(name):
             return f"no setting of this kind of run: {advice}"
     known = [key for section in _options_at(model, location[:-1]) for key in section.model_fields]
+    if len(location) == 1 and (inside := [f"{key}.{name}" for key in known if _has(model, key, name)]):
+        return f"unknown setting; did you mean {' or '.join(inside)}?"
     return "unknown setting" + nearest(name, known)
+
+
+def _has(model: type[BaseModel], section: str, name: str) -> bool:
+    """Whether a section of the file has a setting of this name."""
+    return any(name in option.model_fields for option in _options_at(model, (section,)))
 
 
 def position(mistake: str) -> tuple[int, int]:
