@@ -185,6 +185,12 @@ def test_overrides_get_the_same_messages(written, override, message):
     assert any(line.startswith(f"argument '{override}'") for line in lines), lines
 
 
+def test_a_kind_given_alone_is_named_by_the_cure(written):
+    path = written(GOOD.replace("kind: apg", "kind: apg, step: 2.0"))
+    words = "a setting of kind apg, not of adam; to change the kind give the whole section, as in 'solver={kind: adam}'"
+    assert mistakes(path, "solver.kind=adam") == [f"7:21: solver.step: {words}"]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

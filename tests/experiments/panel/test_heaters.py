@@ -51,6 +51,13 @@ def test_a_kernel_that_is_no_gaussian_is_said(tmp_path, capsys):
     assert "(rms): no Gaussian stands for this kernel" in capsys.readouterr().out
 
 
+def test_a_kernel_beside_a_sigma_is_told_how_to_take_its_place(tmp_path, capsys):
+    path = tmp_path / "kernel.npy"
+    np.save(path, kernel())
+    assert main(["check", *SMALL, f"modulator.kernel={path}"]) == 2
+    assert f"got both; to use the file give 'modulator={{kernel: {path}}}'\n" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
