@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.optics.picture import tone_map
@@ -34,11 +35,13 @@ def show(
         A matplotlib figure; ``figure.savefig("field.png")`` writes it, and a notebook shows it.
 
     Raises:
+        TypeError: The values are no tensor.
         ValueError: No image axes, an unknown quantity, "amplitude" or "phase" of real values, "colour" of other than
-            three channels, or more than 24 panels.
+            three channels, more names than items, or more than 24 panels.
     """
     from matplotlib.figure import Figure
 
+    checks.tensor("values", values)
     if values.ndim < 2 or 0 in values.shape:
         raise ValueError(f"values must end in (H, W) and not be empty, got {tuple(values.shape)}")
     chosen = [what] if isinstance(what, str) else what or (QUANTITIES[:2] if values.is_complex() else QUANTITIES[2:3])
@@ -46,6 +49,8 @@ def show(
     columns = max(len(panels) for _, panels in rows)
     if columns * len(rows) > _MOST:
         raise ValueError(f"values make {columns * len(rows)} panels, more than {_MOST}; show a part of them")
+    if len(names) > columns:
+        raise ValueError(f"expected at most {columns} names, one for each item, got {len(names)}: {list(names)}")
     figure = Figure(figsize=(3.4 * columns, 3.0 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
     for row, (name, panels) in enumerate(rows):

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import numbers
+import re
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -15,6 +16,8 @@ from holotorch.core.quantities import OFFSET, WAVELENGTH, Quantity
 
 _SMALL = 64 << 20  # bytes: smaller requests skip the check, since reading the available memory takes 0.1 ms
 _PHASE_ERROR = 0.01  # rad: a rounding error of the phase this large causes a warning; it changes a field by 1 %
+_LENGTH = re.compile(r"\s*([-+]?\d+(?:\.\d*)?)\s*([nuµμmc])m\s*")  # a number and its unit
+_EXPONENTS = {"n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2}
 
 
 class SamplingWarning(UserWarning):
@@ -175,26 +178,36 @@ def wavelengths(values: float | Sequence[float] | Tensor) -> tuple[float, ...]:
     return tuple(quantity(WAVELENGTH, item) for item in items)
 
 
+def tensor(name: str, value: Tensor, wanted: str = "a torch.Tensor") -> None:
+    """Raise TypeError unless ``value`` is a tensor; the message names what makes one of an array or a list."""
+    if not isinstance(value, Tensor):
+        cure = {"ndarray": "; use torch.from_numpy(...)", "list": "; use torch.tensor(...)"}
+        got = type(value).__name__
+        raise TypeError(f"{name} must be {wanted}, got {got}{cure.get(got, '')}")
+
+
 def field(name: str, value: Tensor, shape: tuple[int, ...], *, complex_valued: bool = True) -> None:
     """Raise TypeError unless ``value`` is a complex tensor, and ValueError unless its shape ends in ``shape``.
 
     ``shape`` is (C, H, W) or (H, W). With ``complex_valued=False`` the tensor must be real instead.
     """
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+    tensor(name, value)
     axes = "(C, H, W)" if len(shape) == 3 else "(H, W)"
     if tuple(value.shape[-len(shape) :]) != shape:
         raise ValueError(f"{name} must end in {axes} = {shape}, got {tuple(value.shape)}")
     if not complex_valued:
         real(name, value)
     elif not value.is_complex():
-        raise TypeError(f"{name} must be complex (complex64 or complex128), got {value.dtype}; use torch.complex")
+        cure = "of a real field give field + 0j, of amplitude and phase torch.polar(amplitude, phase)"
+        raise TypeError(f"{name} must be complex (complex64 or complex128), got {value.dtype}; {cure}")
 
 
 def real(name: str, value: Tensor) -> None:
     """Raise TypeError unless ``value`` is a real floating-point tensor."""
-    if not isinstance(value, Tensor) or not value.is_floating_point():
-        raise TypeError(f"{name} must be a real floating-point tensor, got {getattr(value, 'dtype', type(value))}")
+    wanted = "a real floating-point tensor"
+    tensor(name, value, wanted)
+    if not value.is_floating_point():
+        raise TypeError(f"{name} must be {wanted}, got {value.dtype}")
 
 
 def all_finite(name: str, value: Tensor) -> None:
@@ -233,7 +246,9 @@ def _number(name: str, value: Any, unit: str) -> float:
     except OverflowError:  # an integer too large for a float
         return math.inf if int(value) > 0 else -math.inf
     except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
+        match = _LENGTH.fullmatch(value) if isinstance(value, str) and unit == "metres" else None
+        cure = f"; give {match[1]}e{_EXPONENTS[match[2]]}" if match else ""
+        raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}{cure}") from None
 
 
 def _in(unit: str) -> str:

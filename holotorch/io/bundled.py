@@ -21,7 +21,17 @@ def find_config(name: str | Path) -> Path | None:
     A bundled configuration is named with or without the folder, such as "configs/demo.yaml". In an installed package
     ``configs`` lies inside the package, and in a checkout beside it.
     """
-    path, package = Path(name), Path(__file__).parents[1]
+    return next((candidate for candidate in _candidates(Path(name)) if candidate.is_file()), None)
+
+
+def similar_config(path: Path) -> Path | None:
+    """The configuration most similar to ``path``, which is no file, among its neighbours; None if there is none."""
+    names = {each.name for candidate in _candidates(path) for each in candidate.parent.glob("*.yaml")}
+    near = difflib.get_close_matches(path.name, sorted(names), 1)
+    return path.with_name(near[0]) if near else None
+
+
+def _candidates(path: Path) -> tuple[Path, ...]:
+    package = Path(__file__).parents[1]
     inside = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
-    candidates = (path, package / "configs" / inside, package.parent / "configs" / inside)
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return path, package / "configs" / inside, package.parent / "configs" / inside

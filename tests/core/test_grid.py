@@ -51,6 +51,9 @@ def test_padded_takes_good_lengths_and_leaves_factor_one_alone(factor, shape):
         ((8, True), 1e-6, TypeError, "whole number"),
         (None, 1e-6, TypeError, "whole number"),
         (8, True, TypeError, "number"),
+        (8, "12um", TypeError, "grid pitch must be a number in metres, got str '12um'; give 12e-6$"),
+        (8, (12e-6, "0.5 mm"), TypeError, "got str '0.5 mm'; give 0.5e-3$"),
+        ("64", 1e-6, TypeError, "whole number"),
         ((8, 8, 8), 1e-6, ValueError, r"\(H, W\)"),
     ],
 )

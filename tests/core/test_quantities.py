@@ -4,6 +4,7 @@ import dataclasses
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 
@@ -80,6 +81,25 @@ def test_tensors_are_checked_element_by_element_with_their_gradients():
         checks.quantity(quantities.WAVELENGTH, "450 nm")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="cannot carry a gradient"):
         checks.quantity(quantities.WAVELENGTH, waves[0, 0])  # type: ignore[arg-type]
+
+
+def test_what_is_no_tensor_is_told_how_to_become_one():
+    for check in (checks.real, lambda name, value: checks.field(name, value, (2, 2))):
+        with pytest.raises(TypeError, match=r"light must be a.* got ndarray; use torch.from_numpy\(\.\.\.\)$"):
+            check("light", np.zeros((2, 2)))
+        with pytest.raises(TypeError, match=r"light must be a.* got list; use torch.tensor\(\.\.\.\)$"):
+            check("light", [[0.0, 0.0], [0.0, 0.0]])
+        with pytest.raises(TypeError, match="light must be a.* got NoneType$"):
+            check("light", None)
+
+
+def test_a_real_field_is_told_how_to_become_complex():
+    with pytest.raises(TypeError) as caught:
+        checks.field("light", torch.ones(2, 2), (2, 2))
+    cure = "of a real field give field + 0j, of amplitude and phase torch.polar(amplitude, phase)"
+    assert str(caught.value) == f"light must be complex (complex64 or complex128), got torch.float32; {cure}"
+    checks.field("light", torch.ones(2, 2) + 0j, (2, 2))
+    checks.field("light", torch.polar(torch.ones(2, 2), torch.zeros(2, 2)), (2, 2))
 
 
 def test_grids_refuse_a_pitch_in_other_units():

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -38,3 +39,10 @@ def test_refuses_other_channel_counts():
         for shape in ((2, 4, 5), (3, 2, 4, 5), (4, 5)):  # (3, 2, 4, 5): colours before frames
             with pytest.raises(ValueError, match=r"\(C, H, W\) with C = 3, one per wavelength, got .* \[F, C, H, W\]"):
                 call(torch.rand(shape))
+
+
+def test_an_array_of_numpy_is_told_to_become_a_tensor():
+    array = PhasedArray(WAVES, ThermalCrosstalk(0))
+    for call in (array, array.temperature, array.phase):
+        with pytest.raises(TypeError, match=r"phase or temperature must be .* got ndarray; use torch.from_numpy"):
+            call(np.zeros((3, 4, 5)))

@@ -49,7 +49,8 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     key = _written_key(source, entry["loc"])
     kind, given = entry["type"], entry["input"]
     if kind == "extra_forbidden":
-        return source.mistake(key, _unknown(model, entry["loc"], str(key[-1])))
+        chosen = source.positions.get((*key[:-1], "kind"), "").startswith("argument")
+        return source.mistake(key, _unknown(model, entry["loc"], str(key[-1]), chosen))
     if kind == "missing":
         return source.mistake(key, "required, but missing")
     if kind in ("union_tag_not_found", "union_tag_invalid"):
@@ -74,17 +75,26 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else hint))
 
 
-def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:
+def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str, chosen: bool) -> str:
+    """Why the section at ``location`` has no setting ``name``; ``chosen``: an argument alone sets its kind."""
     sections = _options_at(model, location[:-2])
     kinds = [tag for section in sections if name in section.model_fields for tag in _tags(section)]
     if kinds and len(location) > 2:
-        whole = f"to change the kind give the whole section, as in '{location[-3]}={{kind: {kinds[0]}}}'"
+        kind = location[-2] if chosen else kinds[0]
+        whole = f"to change the kind give the whole section, as in '{location[-3]}={{kind: {kind}}}'"
         return f"a setting of kind {' and '.join(kinds)}, not of {location[-2]}; {whole}"
     for section in _options_at(model, location[:-1]):
         if advice := getattr(section, "elsewhere", {}).get(name):
             return f"no setting of this kind of run: {advice}"
     known = [key for section in _options_at(model, location[:-1]) for key in section.model_fields]
+    if len(location) == 1 and (inside := [f"{key}.{name}" for key in known if _has(model, key, name)]):
+        return f"unknown setting; did you mean {' or '.join(inside)}?"
     return "unknown setting" + nearest(name, known)
+
+
+def _has(model: type[BaseModel], section: str, name: str) -> bool:
+    """Whether a section of the file has a setting of this name."""
+    return any(name in option.model_fields for option in _options_at(model, (section,)))
 
 
 def position(mistake: str) -> tuple[int, int]:

@@ -105,8 +105,14 @@ def _missing_unit(kind: Quantity, value: float) -> str:
     return kind.cure(value)
 
 
+_TIMES = re.compile(r"(\d[^x×]{0,20}?)\s*[x×]\s*(\d[^x×]{0,20})")
+
+
 def pair(value: Any) -> Any:
-    """A single value becomes a pair for both axes."""
+    """A single value becomes a pair for both axes; an error for a text such as 100x200."""
+    if isinstance(value, str) and (match := _TIMES.fullmatch(value)):
+        wanted = f"expected [rows, columns] in brackets, such as [{match[1]},{match[2]}]"
+        raise PydanticCustomError("pair", "{message}", {"message": wanted})
     return value if isinstance(value, list | tuple) else (value, value)
 
 

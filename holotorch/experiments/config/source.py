@@ -7,6 +7,7 @@ from typing import Any
 import yaml
 
 from holotorch.experiments.config.errors import ConfigError, short
+from holotorch.io.bundled import similar_config
 
 Key = tuple[str | int, ...]
 _MAX_BYTES = 1 << 17  # limit for a file; parsing that many bytes takes up to 4 s
@@ -43,6 +44,8 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
         text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a UTF-8 text file"
+        if isinstance(error, FileNotFoundError) and (near := similar_config(path)):
+            reason = f"{reason}; did you mean {near}?"
         raise ConfigError([f"{path}: cannot read the configuration: {reason}"]) from None
     if len(data) > _MAX_BYTES:
         size = f"more than {_MAX_BYTES} bytes"

@@ -218,7 +218,7 @@ def contradictions(settings: PECSettings) -> Iterator[tuple[Key, str]]:
         yield ("target", "region"), f"expected at least 11 x 11 px for ssim, got {region}"
     chip = settings.modulator
     if (chip.sigma_px is None) == (chip.kernel is None):
-        got = "both" if chip.kernel else "neither"
+        got = f"both; to use the file give 'modulator={{kernel: {chip.kernel}}}'" if chip.kernel else "neither"
         yield ("modulator", "sigma_px"), f"expected sigma_px, or kernel with a file in its place, got {got}"
     if chip.kernel is not None and size is not None:
         yield ("modulator", "kernel_size"), "a measured kernel has the size of its file; leave this out"

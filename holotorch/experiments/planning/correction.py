@@ -45,23 +45,47 @@ def measured_crosstalk(path: str, shape: Sequence[int], key: str) -> ThermalCros
     try:
         crosstalk = ThermalCrosstalk.from_patch(rises)
     except ValueError as error:
-        raise ConfigError([f"{key}: {error}{_centred(rises)}"]) from error
+        raise ConfigError([f"{key}: {error}{_cure(rises)}"]) from error
+    if rivals := _rivals(rises):
+        raise ConfigError([f"{key}: {path}: {rivals}"])
     if any(taps > side for taps, side in zip(crosstalk.kernel.shape, shape, strict=True)):
         size = f"{crosstalk.kernel.shape[0]} x {crosstalk.kernel.shape[1]}"
         raise ConfigError([f"{key}: {size} taps are more than the {tuple(shape)} px of the array"])
     return crosstalk
 
 
-def _centred(rises: Tensor) -> str:
-    """What to keep of a table of rises [h, w] whose warmest pixel is not in the middle; empty if it is."""
+def _cure(rises: Tensor) -> str:
+    """What to change in a table of rises [h, w] that is refused, as the end of a message; empty if it is not known."""
     if not rises.numel() or not bool(rises.isfinite().all()):
         return ""
+    if bool((rises < 0).any()):
+        below = rises[rises < 0]
+        return f"; rises are negative ({below.min():g} ... {below.max():g}): subtract the ambient temperature"
     row, column = divmod(int(rises.argmax()), rises.shape[1])
     down, across = min(row, rises.shape[0] - 1 - row), min(column, rises.shape[1] - 1 - column)
     if (2 * down + 1, 2 * across + 1) == tuple(rises.shape):
         return ""
-    kept = f"rows {row - down + 1} to {row + down + 1} and columns {column - across + 1} to {column + across + 1}"
-    return f"; the warmest pixel is in row {row + 1}, column {column + 1} of the file: keep {kept}"
+    place = f"; the warmest pixel is in row {row + 1}, column {column + 1} of the file"
+    if all(side == 1 or kept > 0 for side, kept in zip(rises.shape, (down, across), strict=True)):
+        kept = f"rows {row - down + 1} to {row + down + 1} and columns {column - across + 1} to {column + across + 1}"
+        return f"{place}: keep {kept}"
+    even = [name for name, side in zip(("a row", "a column"), rises.shape, strict=True) if side % 2 == 0]
+    if not even:
+        return f"{place}: it needs neighbours on all sides"
+    size, lines = " x ".join(map(str, rises.shape)), " and ".join(even)
+    return f"; {size}: add or drop {lines} so that the heated pixel is in the middle"
+
+
+def _rivals(rises: Tensor) -> str:
+    """What is wrong with a table of rises [h, w] in which others are as warm as the middle; empty if none is."""
+    centre = rises[rises.shape[0] // 2, rises.shape[1] // 2]
+    warm = rises >= centre
+    warm[rises.shape[0] // 2, rises.shape[1] // 2] = False
+    if not bool(warm.any()):
+        return ""
+    rows = ", ".join(str(row + 1) for row in warm.any(1).nonzero().flatten().tolist())
+    others = f"in rows {rows} of the file, {int(warm.sum())} pixels are" if "," in rows else f"pixels of row {rows} are"
+    return f"{others} as warm as the heated pixel in the middle ({centre.item()}): is this a kernel?"
 
 
 def complete_kernel(sigma_px: float) -> ThermalCrosstalk:

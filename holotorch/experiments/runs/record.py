@@ -9,6 +9,9 @@ from typing import Any
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.io.files import read_json
 
+_SUMMARIES = ("summary.json", "interrupted.json")
+_LISTED = 6  # run folders that a message lists
+
 
 class RunRecord:
     """The files in the ``folder`` of a run, complete or interrupted. ConfigError if the folder holds no run.
@@ -19,7 +22,11 @@ class RunRecord:
 
     def __init__(self, folder: Path):
         self.folder, self.title = folder, folder.resolve().name
-        names = [name for name in ("summary.json", "interrupted.json") if (folder / name).is_file()]
+        names = [name for name in _SUMMARIES if (folder / name).is_file()]
+        if not names and len(inside := _runs_in(folder)) > 1:
+            more = ", ..." if len(inside) > _LISTED else ""
+            words = ", ".join(map(str, inside[:_LISTED]))
+            raise ConfigError([f"{folder} holds several runs in folders of their own: give one of {words}{more}"])
         if not names:
             hint = f"; finish it with: holotorch resume {folder}" if (folder / "plan.json").is_file() else ""
             raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{hint}"])
@@ -46,3 +53,8 @@ class RunRecord:
         """A picture in the folder as a data URL; empty if there is no such file."""
         path = self.folder / "images" / f"{name}.png"
         return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if path.is_file() else ""
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    """The folders directly inside ``folder`` that hold a run, as in that of ``holotorch demo`` or of a sweep."""
+    return sorted({path.parent for name in _SUMMARIES for path in folder.glob(f"*/{name}")})

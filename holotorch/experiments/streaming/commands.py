@@ -61,7 +61,7 @@ def _count(text: str) -> int:
 def _stream(options: argparse.Namespace) -> int:
     options.view = options.view or any(getattr(options, name) is not None for name in _OF_PAGE)
     if options.replay:
-        options.sources = [*options.sources, str(options.replay / "poses.csv")]
+        options.sources = [*options.sources, str(_poses_of(options.replay))]
     if options.check or (options.view and not options.sources):
         _need_no_source(options)
     if options.check:
@@ -79,6 +79,18 @@ def _stream(options: argparse.Namespace) -> int:
         return OK
     with _rendered(options):
         return _send(options)
+
+
+def _poses_of(folder: Path) -> Path:
+    """The poses.csv of a run; ConfigError for a folder without one, which says what the folder holds."""
+    poses = folder / "poses.csv"
+    if not poses.is_file():
+        from holotorch.experiments.config.errors import ConfigError
+        from holotorch.experiments.runs.record import RunRecord
+
+        kind = RunRecord(folder).kind
+        raise ConfigError([f"{folder} holds a run of kind {kind} without poses.csv; --replay takes a run of track"])
+    return poses
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from pydantic_core import PydanticCustomError
 
+from holotorch.core.quantities import BOARD_SQUARE
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.settings import metres
 from holotorch.experiments.tracking.devices import save_camera
@@ -86,13 +87,21 @@ def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
     charuco = re.fullmatch(rf"charuco {sides} (\S+) (\S+) (\S+)", text)
     try:
         if chessboard:
-            return Chessboard(int(chessboard[1]), int(chessboard[2]), float(metres(chessboard[3])))
+            return Chessboard(int(chessboard[1]), int(chessboard[2]), _side(chessboard[3]))
         if charuco:
-            square, marker = float(metres(charuco[3])), float(metres(charuco[4]))
+            square, marker = _side(charuco[3]), _side(charuco[4])
             return Charuco(int(charuco[1]), int(charuco[2]), square, marker, dictionary=charuco[5])
     except (PydanticCustomError, ValueError) as error:
         raise ConfigError([f"--board: {error}"]) from None
     raise ConfigError([f"--board: expected {_KINDS}, got {' '.join(words)!r}"])
+
+
+def _side(text: str) -> float:
+    """A side in metres. ValueError for a number without a unit that is a usual side only in millimetres."""
+    side = float(metres(text))
+    if BOARD_SQUARE.problem(side) and not re.search(r"[a-zµμ]$", text) and not BOARD_SQUARE.problem(side / 1000):
+        raise ValueError(f"{text} means metres: did you mean {text}mm?")
+    return side
 
 
 def calibration_text(calibration: Calibration, missing: dict[str, str], board: Sequence[str] = BOARD) -> str:

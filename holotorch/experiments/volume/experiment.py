@@ -1,6 +1,7 @@
 """The volume experiment: the volume of a configuration, its renderer and a hologram for each colour."""
 
 import math
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -41,6 +42,16 @@ _PRIMARIES = 450e-9, 530e-9, 630e-9  # metres: wavelengths of a volume's blue, g
 _QUICK_PLANES = 1000  # planes of a quick rendering at most; as many slabs as voxels along the depth are thin enough
 # Shares of red, green and blue that each wavelength shows, longest first, for fewer wavelengths than colours.
 _SHOWN = {1: ((1 / 3, 1 / 3, 1 / 3),), 2: ((0.5, 0.5, 0.0), (0.0, 0.5, 0.5))}
+
+# Arguments in the messages of ``load_volume``, and the settings that stand for them; those named in full come first.
+_SETTINGS = (
+    (r"spacing=\(z, y, x\) in metres, such as \(1e-3, 5e-4, 5e-4\)", "spacing=[1e-3,5e-4,5e-4] (z, y, x in metres)"),
+    (r"spacing=1, unit='relative'", "spacing=[1,1,1] unit=relative"),
+    (r"unit='relative'", "unit=relative"),
+    (r"shape=\(D, H, W\) and dtype=(, such as 'uint8')?", "shape=[D,H,W] dtype=uint8"),
+    (r"shape=\(([\w, ]+)\)", r"shape=[\1]"),
+    (r"(?<![\w.])(spacing|shape|dtype|unit)=", r"volume.\1="),
+)
 
 
 @dataclass(frozen=True)
@@ -321,7 +332,7 @@ def open_volume(source: VolumeSource) -> tuple[Volume, str]:
             options = {"spacing": spacing, "shape": source.shape, "dtype": source.dtype, "unit": source.unit}
             return load_volume(source.path, **options), ""
     except ValueError as error:
-        raise ConfigError([f"volume: {error}"]) from error
+        raise ConfigError([f"volume: {_as_settings(str(error))}"]) from error
     except OSError as error:
         raise ConfigError([f"volume.path: {source.path}: {error.strerror or error}"]) from error
     reason = "a phantom was asked for"
@@ -338,6 +349,13 @@ def open_volume(source: VolumeSource) -> tuple[Volume, str]:
             raise ConfigError([f"volume.scene: {reason}, or volume.phantom to stand in for it"])
     assert source.phantom is not None
     return getattr(phantoms, source.phantom)(source.samples, dtype=torch.uint8), reason
+
+
+def _as_settings(message: str) -> str:
+    """A message of ``load_volume`` with its arguments written as settings, which a command can take as they are."""
+    for argument, setting in _SETTINGS:
+        message = re.sub(argument, setting, message)
+    return message
 
 
 def _shared(transfer: TransferFunction, wavelengths: Sequence[float]) -> TransferFunction:

@@ -145,6 +145,13 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         ("solver=3", "solver: expected settings, as in {key: value}, got 3"),
         ("seed=-1", "seed: expected greater than or equal to 0, got -1"),
         ("grid.shape=", "grid.shape: expected a whole number, got nothing"),
+        (
+            "grid.shape=100x200",
+            "grid.shape: expected [rows, columns] in brackets, such as [100,200], got '100x200'",
+        ),
+        ("grid.pitch=9um x 8um", "expected [rows, columns] in brackets, such as [9um,8um], got '9um x 8um'"),
+        ("sigma_px=0.9", "sigma_px: unknown setting; did you mean modulator.sigma_px?"),
+        ("learning_rate=0.9", "learning_rate: unknown setting; did you mean solver.learning_rate?"),
         ("target.region=[33,48]", "target.region: expected at most the grid, (32, 48), got (33, 48)"),
         ("target.region=[32,49]", "target.region: expected at most the grid, (32, 48), got (32, 49)"),
         ("target.region=10", "target.region: expected at least 11 x 11 px for ssim, got (10, 10)"),
@@ -176,6 +183,12 @@ def test_overrides_get_the_same_messages(written, override, message):
     lines = mistakes(written(GOOD + "seed: 1\n"), override)
     assert any(message in line for line in lines), lines
     assert any(line.startswith(f"argument '{override}'") for line in lines), lines
+
+
+def test_a_kind_given_alone_is_named_by_the_cure(written):
+    path = written(GOOD.replace("kind: apg", "kind: apg, step: 2.0"))
+    words = "a setting of kind apg, not of adam; to change the kind give the whole section, as in 'solver={kind: adam}'"
+    assert mistakes(path, "solver.kind=adam") == [f"7:21: solver.step: {words}"]
 
 
 @pytest.mark.parametrize(
@@ -251,8 +264,11 @@ def test_single_values_stand_for_lists(written):
 
 
 def test_missing_and_binary_files(tmp_path):
-    with pytest.raises(ConfigError, match="cannot read the configuration: No such file"):
+    with pytest.raises(ConfigError, match="cannot read the configuration: No such file or directory$"):
         load_config(tmp_path / "missing.yaml")
+    # A bundled configuration is named as it was asked for, wherever its file lies.
+    with pytest.raises(ConfigError, match=r"directory; did you mean configs/pec/fourier\.yaml\?$"):
+        load_config("configs/pec/fourrier.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="not a UTF-8 text file"):
         load_config(tmp_path / "binary.yaml")

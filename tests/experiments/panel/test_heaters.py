@@ -51,6 +51,13 @@ def test_a_kernel_that_is_no_gaussian_is_said(tmp_path, capsys):
     assert "no Gaussian represents this kernel" in capsys.readouterr().out
 
 
+def test_a_kernel_beside_a_sigma_is_told_how_to_take_its_place(tmp_path, capsys):
+    path = tmp_path / "kernel.npy"
+    np.save(path, kernel())
+    assert main(["check", *SMALL, f"modulator.kernel={path}"]) == 2
+    assert f"got both; to use the file give 'modulator={{kernel: {path}}}'\n" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -61,6 +68,16 @@ def test_a_kernel_that_is_no_gaussian_is_said(tmp_path, capsys):
             "kernel.csv",
             "0,0,0,0\n0,1,0,0\n1,9,2,0\n0,1,0,0",
             "; the warmest pixel is in row 3, column 2 of the file: keep rows 2 to 4 and columns 1 to 3",
+        ),
+        ("kernel.csv", "0,1\n1,2", "; 2 x 2: add or drop a row and a column so that the heated pixel is in the middle"),
+        ("kernel.csv", "1,2,1\n0,1,0", "; 2 x 3: add or drop a row so that the heated pixel is in the middle"),
+        ("kernel.csv", "9,1,0\n1,2,1\n0,1,0", "in row 1, column 1 of the file: it needs neighbours on all sides"),
+        ("kernel.csv", "-1,-0.5,-1\n-0.5,-0.2,3\n-1,-0.5,-1", "rises are negative (-1 ... -0.2): subtract the ambient"),
+        ("kernel.csv", "1,0,0\n0,1,0\n0,0,1", "in rows 1, 3 of the file, 2 pixels are as warm as the heated pixel in"),
+        (
+            "kernel.csv",
+            "0,0,0\n1,1,0\n0,0,0",
+            "pixels of row 2 are as warm as the heated pixel in the middle (1.0): is",
         ),
         ("kernel.png", "no numbers", "levels of a picture are no temperatures, write the rises as numbers"),
         ("kernel.csv", "0,1,0\n1,nan,1\n0,1,0", "nan"),

@@ -261,12 +261,20 @@ def test_the_command_replays_a_run_on_a_page_until_it_is_interrupted(tmp_path, m
         return streaming.Streamed(3, True, True)
 
     monkeypatch.setattr(streaming, "stream", streamed)
+    (tmp_path / "poses.csv").touch()
     assert main(["stream", "--view", "--replay", str(tmp_path), "--page", "127.0.0.1:4321"]) == 0
     assert given["sources"] == [str(tmp_path / "poses.csv")] and given["repeat"] and not given["to"]
     assert given["page"].port == 4321 and not given["page"].token
     assert main(["stream", "--view", "--page", "127.0.0.1"]) == 2
     assert "it takes no --page" in capsys.readouterr().err
     assert main(["stream", "a.csv", "--to", "127.0.0.1"]) == 0 and given["page"] is None and not given["repeat"]
+
+
+def test_a_replay_of_another_kind_of_run_is_refused(tmp_path, capsys):
+    (tmp_path / "summary.json").write_text('{"experiment": "pec"}')
+    assert main(["stream", "--view", "--replay", str(tmp_path)]) == 2
+    words = "holds a run of kind pec without poses.csv; --replay takes a run of track"
+    assert capsys.readouterr().err == f"{tmp_path} {words}\n"
 
 
 def test_what_a_page_cannot_be_opened_with_is_said(tmp_path):

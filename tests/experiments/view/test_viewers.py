@@ -228,6 +228,8 @@ def test_folders_that_cannot_be_viewed_are_refused(runs, tmp_path, capsys):
     assert "of kind track" in refusal(copy("a", summary_json='{"experiment": "track", "status": "complete"}'))
     unfinished = copy("b", "summary.json", interrupted_json='{"experiment": "volume", "status": "interrupted"}')
     assert "holotorch resume" in refusal(unfinished)
+    several = f"{tmp_path} holds several runs in folders of their own: give one of {tmp_path / 'a'}, {unfinished}\n"
+    assert refusal(tmp_path) == several
     assert "hologram.npy is not in its arrays" in refusal(copy("c", "arrays/hologram.npy"))
     assert "cannot be read" in refusal(copy("d", summary_json="{"))
     foreign = copy("e", "arrays/hologram.npy")

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -189,6 +190,28 @@ def test_a_range_above_all_values_is_named(tmp_path):
     own = f"volume={{path: {tmp_path / 'eight_bit.npy'}, spacing: 1, unit: relative}}"
     warnings = plan_values(build(settings(own, "transfer={preset: bone, low: 900, high: 1800}")))["warnings"]
     assert any(w.startswith("transfer.low 900 is not below the largest value of the file, 254") for w in warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "cure"),
+    [
+        (
+            "a.npy",
+            "",
+            "volume.spacing=[1e-3,5e-4,5e-4] (z, y, x in metres), or volume.spacing=[1,1,1] volume.unit=relative",
+        ),
+        ("a.npy", ", spacing: 1", "unknown, add volume.unit=relative"),
+        ("a.npy", ", unit: relative", "volume.unit=relative is the unit of volume.spacing="),
+        ("a.npy", ", shape: [4, 4, 5]", "but volume.shape=[4, 4, 5] was asked for"),
+        ("a.raw", "", "pass volume.shape=[D,H,W] volume.dtype=uint8, or '>i2' if big-endian"),
+        ("a.img", "", "under another extension, pass volume.shape=[D,H,W] volume.dtype=uint8"),
+    ],
+)
+def test_what_a_file_does_not_state_is_asked_for_as_settings(tmp_path, name, more, cure):
+    voxels = np.zeros((4, 4, 4), np.uint8)
+    np.save(tmp_path / name, voxels) if name.endswith("npy") else voxels.tofile(tmp_path / name)
+    with pytest.raises(ConfigError, match=re.escape(cure)):
+        build(settings(f"volume={{path: {tmp_path / name}{more}}}"))
 
 
 def test_an_empty_volume_is_black_and_said_to_be(tmp_path, capsys):
