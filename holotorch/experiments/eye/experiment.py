@@ -25,7 +25,7 @@ from holotorch.optics.light.displaced import displaced_eye, displacement
 from holotorch.optics.light.incoherent import disc_source, tilted_wave
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.spectrum import Spectrum
-from holotorch.optics.light.wavelength_sampling import least_followed, seen_light
+from holotorch.optics.light.wavelength_sampling import least_count, pupil_illumination
 from holotorch.optics.picture import equal_power
 from holotorch.optics.viewing.display import Display
 from holotorch.optics.viewing.display_geometry import eyepiece_distance, image_distance
@@ -119,7 +119,7 @@ class Observer:
             # The error of the sum and that of deriving pictures are independent; each may be tolerance / sqrt(2).
             eye, tolerance = self.eye(depth), self.budget.share(WAVELENGTHS) / math.sqrt(2)
             half_width = self.scene.width / 2
-            light = seen_light(self.scene.grid, wavelength, self.display, eye, reach=half_width)
+            light = pupil_illumination(self.scene.grid, wavelength, self.display, eye, reach=half_width)
             if not light.path_difference:
                 words = f"no light of {wavelength * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
                 hint = "change the distances of display, or the pupil"
@@ -129,7 +129,7 @@ class Observer:
             count = (
                 len(samples[0])
                 if self.separate
-                else least_followed(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
+                else least_count(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
             )
             self._samples[key] = *samples, count
         return self._samples[key]

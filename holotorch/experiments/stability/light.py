@@ -14,7 +14,7 @@ from holotorch.experiments.stability.sweep import ASKED, Answer, Sweep
 from holotorch.optics import Display, Eye, Retina, SpectralRetina, Spectrum
 from holotorch.optics.free_space.cropped import CroppedKernel
 from holotorch.optics.light.coherence import path_difference
-from holotorch.optics.light.wavelength_sampling import least_followed, neighbour_error, seen_light
+from holotorch.optics.light.wavelength_sampling import least_count, neighbour_error, pupil_illumination
 
 CENTRE = 520e-9  # metres
 SMALL, GRID = Grid((20, 17), 8e-6), Grid((40, 32), 8e-6)  # of a hologram alone, and of one behind an eyepiece
@@ -83,8 +83,8 @@ def _followed(tolerance: float, fwhm: float) -> Answer:
     The error of the propagation of each wavelength is left to ``Retina`` and is the same in the reference.
     """
     wavelengths, weights = _light(fwhm)
-    count = least_followed(wavelengths, weights, tolerance, GRID, *OPTICS)
-    light = seen_light(GRID, wavelengths.mean().item(), *OPTICS)
+    count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
+    light = pupil_illumination(GRID, wavelengths.mean().item(), *OPTICS)
     predicted = neighbour_error(wavelengths, weights, count, light)
     retina = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE)
     return Answer(retina(_inside()), predicted, f"{count} of {EVERY} wavelengths", tolerance)
@@ -93,7 +93,7 @@ def _followed(tolerance: float, fwhm: float) -> Answer:
 def _each(tolerance: float, fwhm: float) -> Tensor:
     """The same image with every wavelength propagated, in the same window, so that the pupil has the same samples."""
     wavelengths, weights = _light(fwhm)
-    count = least_followed(wavelengths, weights, tolerance, GRID, *OPTICS)
+    count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
     wide = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE).wide[0]
     y, x = ((big - small) // 2 for big, small in zip(wide.shape, GRID.shape, strict=True))
     field, total = functional.pad(_inside(), (x, x, y, y)), torch.zeros(1, *wide.shape, dtype=torch.float64)

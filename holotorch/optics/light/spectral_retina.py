@@ -31,7 +31,7 @@ class SpectralRetina(nn.Module):
             K may differ between channels.
         display: Positions of the hologram, the eyepiece and the eye.
         eye: Pupil, retina and accommodation; the image is that of the plane in focus.
-        count: Number of wavelengths to propagate in each channel; ``wavelength_sampling.least_followed`` finds it.
+        count: Number of wavelengths to propagate in each channel; ``wavelength_sampling.least_count`` finds it.
         recompute: In training, take a third more time and only the memory of one propagated wavelength of one channel
             of one field, as in :func:`incoherent_sum`.
         options: ``tolerance``, ``paraxial``, ``reach``, ``registered`` and ``memory_limit`` of ``Retina``, for the
