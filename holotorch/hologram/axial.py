@@ -18,7 +18,7 @@ from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.nodes import Nodes, axial_range, choose_nodes
 from holotorch.hologram.padding import Axis, choose_length, faded_out
 from holotorch.hologram.raster import Raster, has_light
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 from holotorch.optics.free_space.padding import FINEST
 
 _GROUP = 16  # largest number of planes that one matrix product spreads onto the nodes
@@ -48,7 +48,7 @@ class AxialDesign:
         """
         _, offset = self._axial_frequency(like.device)
         whole = torch.ones(self.size, dtype=like.dtype, device=like.device)
-        return multiply_even(whole, turns_phasor(offset * (self.nodes.spacing * nodes)).to(like.dtype))
+        return multiply_even(whole, cycles_phasor(offset * (self.nodes.spacing * nodes)).to(like.dtype))
 
     def last(self, node: int, like: Tensor) -> Tensor:
         """First quadrant of the factor by which the sum over all nodes is multiplied, to give the hologram's spectrum.
@@ -64,7 +64,7 @@ class AxialDesign:
                 strength = strength * taper(2 * axis.pitch * frequency)
             strength = strength * faded_out(frequency / axial, *axis.fade(length))
         # The factor i of Weyl's expansion is a phase of a quarter cycle.
-        wave = turns_phasor(offset * self.nodes.depth(node) + 0.25)
+        wave = cycles_phasor(offset * self.nodes.depth(node) + 0.25)
         return (wave * strength).to(like.dtype)
 
     def _axial_frequency(self, device: torch.device) -> tuple[Tensor, Tensor]:

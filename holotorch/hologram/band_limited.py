@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.hologram.cone import TAPER_BEGIN, taper
-from holotorch.optics.free_space.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.kernels import carrier, cycles_phasor
 
 _RULE = np.polynomial.legendre.leggauss(64)  # nodes and weights of one panel
 _CYCLES = 10.0  # cycles of the integrand allowed per panel; up to about 15 the rule is exact to rounding
@@ -30,7 +30,7 @@ def point_spectrum(fy: Tensor, fx: Tensor, wavelength: float, depth: float) -> T
     square = fy.square() + fx.square()
     axial = torch.sqrt(wavelength**-2 - square)
     cycles = 0.25 - depth * square / (axial + 1 / wavelength)
-    return turns_phasor(cycles) * (carrier(wavelength, depth).to(square.device) / axial)
+    return cycles_phasor(cycles) * (carrier(wavelength, depth).to(square.device) / axial)
 
 
 def band_limited_wave(

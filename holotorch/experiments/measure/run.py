@@ -144,20 +144,20 @@ def _followed(settings: MeasureSettings, source: Source, folder: RunFolder, file
     try:
         with tqdm(total=total, unit="frame", desc=settings.protocol, dynamic_ncols=True) as bar:
             for item in _looked(settings, source, track):
-                with deferred(folder.pressed):
+                with deferred(folder.signals):
                     track.take(item)
                     bar.update()
                     done = guide is not None and guide(item.frame.seconds, item.pose)
-                if done or folder.pressed:
+                if done or folder.signals:
                     break
     except KeyboardInterrupt:
         pass  # whether it ends the run is decided below
     finally:
         if source.inputs is not None:
-            with deferred(folder.pressed):
+            with deferred(folder.signals):
                 source.inputs.frames.__exit__()
                 _keep(track, folder.path, files, f"{number + 1}" if len(settings.source) > 1 else "")
-    if not track.poses or (folder.pressed and not source.live):
+    if not track.poses or (folder.signals and not source.live):
         raise KeyboardInterrupt
     return track
 

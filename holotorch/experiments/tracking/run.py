@@ -189,7 +189,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         pass
     except Exception as error:  # it is raised again after the poses before it are saved
         failure = error
-    with deferred(run.pressed):
+    with deferred(run.signals):
         for each in reversed(opened):  # each is closed as after a success, even if closing another one fails
             try:
                 each.__exit__(None, None, None)
@@ -213,7 +213,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         results.write(save_figure, folder, log)
         if failure is not None:
             results.failure = None  # only the first failure is reported
-        done = failure is None and (not run.pressed or frames.live)
+        done = failure is None and (not run.signals or frames.live)
         complete = conclude(run, _without_nan(summary), results, done=done)
     if failure is not None:
         raise failure
@@ -247,10 +247,10 @@ def _track_all(
         movie = entered(replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
     if settings.record:
         recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, inputs.paths)
-        source = _recorded(source, entered(recorder), run.pressed)
+        source = _recorded(source, entered(recorder), run.signals)
     bar = entered(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
     for item in follow(source, inputs.tracker):
-        with deferred(run.pressed):
+        with deferred(run.signals):
             _append(table, row(item))
             if in_headset and experiment.to_headset:
                 _append(in_headset, row(item._replace(pose=experiment.to_headset(item.pose))))
@@ -264,14 +264,14 @@ def _track_all(
             log.take(item, drawn)
             bar.set_postfix_str(f"{item.status.name}, {1e3 * item.seconds:.1f} ms", refresh=False)
             bar.update()
-        if run.pressed:
+        if run.signals:
             break
 
 
-def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:
+def _recorded(frames: Iterator[Frame], recorder: Recorder, signals: list[int]) -> Iterator[Frame]:
     """Record each frame and then yield it."""
     for frame in frames:
-        with deferred(pressed):
+        with deferred(signals):
             recorder.write(frame)
         yield frame
 

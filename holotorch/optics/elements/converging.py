@@ -14,7 +14,7 @@ from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE, FOCAL_LENGTH, WAVELENGTH
 from holotorch.optics.elements.lens_response import lens_matrices
 from holotorch.optics.free_space.impulse_response import fresnel_taps, tap_indices
-from holotorch.optics.free_space.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.kernels import carrier, cycles_phasor
 
 _TRUSTED = 0.1  # rad: a warning is emitted if the paraxial model neglects a larger phase
 
@@ -214,7 +214,7 @@ class ConvergingFresnel(FieldOperator):
     def _curvature(self, axis: int, wavelength: Tensor) -> Tensor:
         """exp(-i pi x^2 / (wavelength (focus - distance))) on the samples of the result, complex128 [C, n']."""
         position = self.out_grid.coordinates()[axis].reshape(-1) + self.offset[axis]
-        return turns_phasor(-position.square() / (2 * wavelength[:, None] * (self.focus - self.distance)))
+        return cycles_phasor(-position.square() / (2 * wavelength[:, None] * (self.focus - self.distance)))
 
     def _neglected_phase(self) -> float:
         phases = [0.0]

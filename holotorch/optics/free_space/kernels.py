@@ -22,7 +22,7 @@ def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
     """
     cycles = _float64(DISTANCE, distance) / _float64(WAVELENGTH, wavelength)
     checks.precise(wavelength, distance)
-    return turns_phasor(cycles)
+    return cycles_phasor(cycles)
 
 
 def angular_spectrum_kernel(
@@ -51,7 +51,7 @@ def angular_spectrum_kernel(
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     cosine, imaginary = direction_cosine(sine2)
     cycles = -distance / wavelength * torch.where(sine2 < 1, sine2 / (1 + cosine), 1)
-    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(cycles)
+    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * cycles_phasor(cycles)
     if not band_limit:
         return kernel
     # tan(angle) = wavelength f / cos. The same limit drops evanescent waves next to the cut-off, which decay
@@ -80,7 +80,7 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     """
     product = (_float64(WAVELENGTH, wavelength) * _float64(DISTANCE, distance))[..., None, None]
     fy, fx = grid.frequencies(product.device)
-    return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
+    return cycles_phasor(-product / 2 * fy.square()) * cycles_phasor(-product / 2 * fx.square())
 
 
 def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *, paraxial: bool = False) -> Tensor:
@@ -118,7 +118,7 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
     return weights
 
 
-def turns_phasor(cycles: Tensor) -> Tensor:
+def cycles_phasor(cycles: Tensor) -> Tensor:
     """exp(2 pi i cycles), with whole cycles subtracted in float64; the gradient is that of the unreduced phase."""
     return phasor(2 * math.pi * (cycles - cycles.detach().round()))
 

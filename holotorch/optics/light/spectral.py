@@ -25,7 +25,7 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity
 from holotorch.core.fourier import centred_fft2, centred_ifft2
 from holotorch.core.grid import Grid
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 from holotorch.optics.light.incoherent import incoherent_sum
 from holotorch.optics.light.wavelength_sampling import error_free, least_count, pupil_exceeds_band, select_wavelengths
 from holotorch.optics.viewing.display import Display, number
@@ -77,13 +77,13 @@ def neighbours(
 
     def parabola(values: Tensor, rate, rows: Tensor, columns: Tensor) -> Tensor:
         rate = torch.as_tensor(rate, dtype=torch.float64, device=values.device)
-        by_row, by_column = turns_phasor(rate * rows.square()), turns_phasor(rate * columns.square())
+        by_row, by_column = cycles_phasor(rate * rows.square()), cycles_phasor(rate * columns.square())
         return values * by_row.to(values.dtype) * by_column.to(values.dtype)
 
     def with_errors(values: Tensor, length: float, sign: int) -> Tensor:
         # Applies the errors of the eye in the plane of its pupil, or removes them with a sign of -1.
         path = eye.path(fy * (length * second), fx * (length * second), length)
-        return centred_ifft2(centred_fft2(values) * turns_phasor(path * (sign / length)).to(values.dtype))
+        return centred_ifft2(centred_fft2(values) * cycles_phasor(path * (sign / length)).to(values.dtype))
 
     rate = first / second / 2
     if error_free(eye):
