@@ -79,7 +79,7 @@ def readable(*tensors: Tensor) -> bool:
 
     They must have values, see :func:`have_values`, on the CPU: reading from a GPU waits for all that it has to do.
     """
-    return have_values(*tensors) and all(each.device.type == "cpu" for each in tensors)
+    return have_values(*tensors) and all(tensor.device.type == "cpu" for tensor in tensors)
 
 
 def have_values(*tensors: Tensor) -> bool:
@@ -90,7 +90,7 @@ def have_values(*tensors: Tensor) -> bool:
     """
     if torch.compiler.is_compiling():
         return False
-    return all(type(each) in (Tensor, nn.Parameter) and not each.is_meta for each in tensors)
+    return all(type(tensor) in (Tensor, nn.Parameter) and not tensor.is_meta for tensor in tensors)
 
 
 def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:

@@ -68,7 +68,7 @@ def _page(outcomes: dict[str, Outcome], out: Path, quick: bool) -> str:
     drawn = sum(not outcome.problem for outcome in outcomes.values())
     title = "Speed against accuracy" + (", quick form" if quick else "")
     status = "complete" if drawn == len(outcomes) else f"{drawn} of {len(outcomes)} drawn"
-    rows = [[name, f"{each.seconds:.1f}" if each.seconds else "", each.problem] for name, each in outcomes.items()]
+    rows = [[name, f"{run.seconds:.1f}" if run.seconds else "", run.problem] for name, run in outcomes.items()]
     rows.append(["all", f"{sum(outcome.seconds for outcome in outcomes.values()):.1f}", ""])
     parts = [page.heading(title, status), page.table(("subject", "seconds", "problem"), rows)]
     for subject, outcome in outcomes.items():

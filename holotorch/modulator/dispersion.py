@@ -163,7 +163,7 @@ def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: f
     solution = torch.linalg.lstsq(matrix, wanted[:, None]).solution[:, 0]
     residuals = wanted - matrix @ solution
     a, b = solution[0].item() * unit / length, solution[1].item() * unit**3 / length
-    if min(a + b / each**2 for each in lengths) <= 0:
+    if min(a + b / wavelength**2 for wavelength in lengths) <= 0:
         raise ValueError(
             "no positive birefringence gives these phases; expected unwrapped ones, falling with wavelength"
         )

@@ -234,7 +234,7 @@ class Observer:
         wavelengths = self.scene.settings.wavelengths
         samples = [self.samples(source, wavelength, depth) for wavelength in wavelengths]
         difference = path_difference(depth, self.aperture(depth))
-        best = [optimum_fwhm(each, self.detail(depth, each), depth) for each in wavelengths]
+        best = [optimum_fwhm(wavelength, self.detail(depth, wavelength), depth) for wavelength in wavelengths]
         quality = ssim((shown / peak).clamp(0, 1), (reference / peak).expand_as(shown), data_range=1.0)
         return {
             "source": source,

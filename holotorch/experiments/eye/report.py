@@ -47,4 +47,4 @@ def eye_section(run: RunRecord) -> list[str]:
 def _cell(value: Any) -> str:
     if not isinstance(value, list):
         return plain(value)
-    return " / ".join("-" if each is None else f"{each:.3g}" for each in value)
+    return " / ".join("-" if item is None else f"{item:.3g}" for item in value)

@@ -54,7 +54,7 @@ def draw(speckle: dict[str, Tensor]) -> bytes:
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     for source, values in speckle.items():
-        frequency, power = (each.tolist() for each in radial_spectrum(values))
+        frequency, power = (curve.tolist() for curve in radial_spectrum(values))
         axes.semilogy(frequency, [max(value, 1e-12) for value in power], ".-", label=source.replace("_", " "))
     axes.set(xlabel="frequency (cycles per sample of the picture)", ylabel="power of the relative speckle")
     axes.grid(alpha=0.3)

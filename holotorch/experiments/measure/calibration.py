@@ -73,7 +73,7 @@ def measure_catheter(
         text = "the edges are measured in the frames: expected a video, a folder, a recording or a camera"
         raise ConfigError([f"{source.name}: {text}, got poses"])
     camera, nominal = source.inputs.camera, source.inputs.catheter
-    whole = [each for each in pixels if each is not None and bool(each.isfinite().all())]
+    whole = [points for points in pixels if points is not None and bool(points.isfinite().all())]
     if not whole:
         text = f"none of {len(pixels)} frames shows all {len(nominal.edges)} edges; show the whole catheter, well lit"
         raise ConfigError([f"{source.name}: {text}"])

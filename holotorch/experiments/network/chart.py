@@ -147,7 +147,7 @@ def _verdict(rows: list[dict], seconds: float, trained: int, held: int, amount: 
         f"trained for {seconds:.0f} s on crops of {trained} pictures; scored on {amount.scored * held} crops of {held} "
         f"others, {GRID.shape[0]} px, one colour, one frame, on {torch.get_num_threads()} threads",
     ]
-    for steps in (each for each in (1, 10, 100) if each in amount.steps):
+    for steps in (count for count in (1, 10, 100) if count in amount.steps):
         lines.append(
             f"{steps} step(s) of L-BFGS: SSIM {cold[steps][0]:.3f} in {cold[steps][1]:.0f} ms; from the network "
             f"{warm[steps][0]:.3f} in {warm[steps][1]:.0f} ms, network included"

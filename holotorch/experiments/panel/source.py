@@ -110,7 +110,7 @@ def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
     phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
 
     def picture(fields: Tensor) -> Tensor:
-        formed = [intensity(experiment.propagator(each.to(experiment.device))) for each in fields]
+        formed = [intensity(experiment.propagator(field.to(experiment.device))) for field in fields]
         return experiment.picture_in(torch.stack(formed).mean(0)).cpu()
 
     return PanelPhases(phase, experiment.wavelengths, experiment.grid, "phase", picture)
@@ -141,7 +141,7 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
     def picture(fields: Tensor) -> Tensor:
         return torch.stack([intensity(propagator(c)(fields[:, c])).mean(0) for c in range(fields.shape[1])])
 
-    phase = torch.stack([ENCODINGS[encoding](each) for each in hologram])
+    phase = torch.stack([ENCODINGS[encoding](field) for field in hologram])
     losses = {
         name: [encoding_loss(hologram[c], phases[c], propagator(c)).item() for c in range(len(hologram))]
         for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram)))

@@ -222,12 +222,12 @@ class PECExperiment:
 
     def intensity(self, phase: Tensor, dtype: torch.dtype | None = None) -> Tensor:
         """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W], by default in their dtype."""
-        return self.mean_intensity(lambda each: self.array(each.to(dtype or each.dtype)), phase)
+        return self.mean_intensity(lambda frame: self.array(frame.to(dtype or frame.dtype)), phase)
 
     def mean_intensity(self, emitted: Callable[[Tensor], Tensor], phase: Tensor) -> Tensor:
         """Mean intensity [C, *image] of the fields ``emitted`` for each frame of heater phases [F, C, H, W]."""
         # One frame at a time, since float64 fields at several depths take much memory.
-        images = (intensity(self.propagator(emitted(each))) for each in phase)
+        images = (intensity(self.propagator(emitted(frame))) for frame in phase)
         return sum(images, next(images)) / len(phase)
 
     def start_phase(self) -> Tensor:

@@ -195,7 +195,7 @@ def _statistic(rows: list[dict[str, str]], statement: dict[str, Any]) -> float:
         return math.nan
     if statement.get("statistic") == "onset":
         least = (1 - statement["fall"]) * values[0]
-        sigmas = [float(each) for each in statement["rows"]["sigma_px"]]
+        sigmas = [float(sigma) for sigma in statement["rows"]["sigma_px"]]
         return next((sigma for sigma, value in zip(sigmas, values, strict=True) if value < least), math.inf)
     if statement.get("statistic") == "range":
         return max(values) - min(values)

@@ -99,7 +99,7 @@ def scaling(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> 
         setup = replace(bench, size=size, sigma_px=sigma)
         rounds = [list(_methods(setup, steps, setting=f"{size} px")) for _ in range(ROUNDS)]
         for row, *others in zip(*rounds, strict=True):
-            seconds = sorted(each["seconds"] for each in (row, *others))
+            seconds = sorted(repeat["seconds"] for repeat in (row, *others))
             spread = round(seconds[-1] / max(seconds[0], 1e-3), 2)
             yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
 
@@ -129,7 +129,7 @@ def starts(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> I
     """Thesis Sec. 4.4.5.2: ``error`` is the share of ``count`` results with speckle noise, before and after a rerun."""
     settings = [(kind, start) for kind in ("fourier", "fresnel") for start in ("hot", "cool", "flat")]
     for (kind, start), sigma in cases.each(
-        [(each, s) for s in sigmas for each in settings], desc="starts", unit="case"
+        [(setting, s) for s in sigmas for setting in settings], desc="starts", unit="case"
     ):
         setup, noisy, scores = replace(bench, kind=kind, sigma_px=sigma), [], []
         for seed in range(2 * DRAWS):

@@ -121,8 +121,8 @@ def checksum(content: Any, most: float = math.inf) -> str:
             total.update(flat.view(torch.uint8).numpy().data if len(flat) else b"")
         elif isinstance(value, dict | list | tuple):
             total.update(f"{'{' if isinstance(value, dict) else '['}{len(value)}".encode())
-            for each in value.items() if isinstance(value, dict) else value:
-                add(each)
+            for item in value.items() if isinstance(value, dict) else value:
+                add(item)
         elif value is None or isinstance(value, str | int | float):
             total.update(f"{value!r};".encode())
         else:

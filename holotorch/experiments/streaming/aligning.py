@@ -110,7 +110,7 @@ class Aligner:
         if len(self._pairs) == _MOST:
             return f"{_MOST} alignments are enough; save them"
         own = (pose.tip, pose.direction, tip, direction / direction.norm())
-        self._pairs.append(torch.cat([each.detach().to("cpu", torch.float64) for each in own]))
+        self._pairs.append(torch.cat([part.detach().to("cpu", torch.float64) for part in own]))
         return ""
 
     def _solve(self) -> str:

@@ -51,7 +51,7 @@ async def _rows(port: int, packets: int) -> list[tuple[bool, str]]:
         PoseReceiver(0, host=_LOOPBACK) as two,
         PoseReceiver(0, host=_LOOPBACK) as behind_relay,
         Relay(behind_relay.port) as relay,
-        PoseSender([(_LOOPBACK, each.port) for each in (one, two, relay)]) as sender,
+        PoseSender([(_LOOPBACK, receiver.port) for receiver in (one, two, relay)]) as sender,
     ):
         await _send(sender, packets)
         for _ in range(200):

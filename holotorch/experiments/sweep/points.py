@@ -53,7 +53,7 @@ def points(words: Sequence[str]) -> list[Point]:
     ]
     if len(grid) > MOST:
         raise ConfigError([f"expected at most {MOST} runs in a sweep"])
-    return [Point(_name(each), (*fixed, *(f"{k}={v}" for k, v in each.items())), each) for each in grid]
+    return [Point(_name(values), (*fixed, *(f"{k}={v}" for k, v in values.items())), values) for values in grid]
 
 
 def _split(text: str) -> list[str]:

@@ -96,7 +96,7 @@ def _merits(summaries: Sequence[dict[str, Any]]) -> list[str]:
     for ending in _MERITS:
         named = [name for name in summaries[0] if name.rpartition(".")[2] == ending]
         named.sort(key=lambda name: (not re.search(r"corrected|joint", name), name.count(".")))
-        found += [name for name in named[:1] if len({str(each.get(name)) for each in summaries}) > 1]
+        found += [name for name in named[:1] if len({str(summary.get(name)) for summary in summaries}) > 1]
     return found[:_PANELS]
 
 

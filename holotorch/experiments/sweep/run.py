@@ -22,9 +22,9 @@ def check_sweep(config: str, words: Sequence[str]) -> str:
     grid = points(words)
     settings = _validated(config, grid)
     times, memory, shortages = [], 0.0, []
-    for each in tqdm(settings, desc="planning", unit="run", disable=None):
-        kind = find_kind(each.experiment)
-        plan = kind.plan(kind.build(each))
+    for setting in tqdm(settings, desc="planning", unit="run", disable=None):
+        kind = find_kind(setting.experiment)
+        plan = kind.plan(kind.build(setting))
         times += [plan.values["predicted_seconds"]] if "predicted_seconds" in plan.values else []
         memory = max(memory, plan.values.get("predicted_peak_bytes", 0.0))
         shortages += [plan.shortage] if plan.shortage else []
@@ -32,7 +32,7 @@ def check_sweep(config: str, words: Sequence[str]) -> str:
         raise ConfigError(list(dict.fromkeys(shortages)))
     cost = f"about {max(1, sum(times)):.3g} s one after the other" if times else "the time is not predicted"
     most = f"; at most {memory / 1e9:.2g} GB of memory for each" if memory else ""
-    swept = ", ".join(f"{key} ({len({each.values[key] for each in grid})})" for key in grid[0].values)
+    swept = ", ".join(f"{key} ({len({point.values[key] for point in grid})})" for key in grid[0].values)
     return f"{len(grid)} runs of {config} over {swept}: {cost}{most}"
 
 

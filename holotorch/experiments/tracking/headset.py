@@ -76,7 +76,7 @@ def read_alignments(path: Path) -> Tensor:
 def axes_matrix(axes: str) -> Tensor:
     """Matrix [3, 3] from coordinates along ``axes`` to RDF; ConfigError unless they are three different directions."""
     letters = [_LETTERS.get(letter) for letter in axes.upper()]
-    known = [each for each in letters if each is not None]
+    known = [letter for letter in letters if letter is not None]
     if len(axes) != 3 or sorted(axis for axis, _ in known) != [0, 1, 2]:
         words = "one of R L, one of U D and one of F B, such as RDF, RUB (WebXR) or RUF (Unity)"
         raise ConfigError([f"--axes: expected {words}, got {axes!r}"])

@@ -190,9 +190,9 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
     except Exception as error:  # it is raised again after the poses before it are saved
         failure = error
     with deferred(run.signals):
-        for each in reversed(opened):  # each is closed as after a success, even if closing another one fails
+        for context in reversed(opened):  # each is closed as after a success, even if closing another one fails
             try:
-                each.__exit__(None, None, None)
+                context.__exit__(None, None, None)
             except OSError as error:
                 failure = failure or error
         if not log.statuses:

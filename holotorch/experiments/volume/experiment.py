@@ -141,7 +141,7 @@ class VolumeExperiment:
     def dtype(self) -> torch.dtype:
         """Precision of the fields: complex128 if a tolerance is below 10 times the rounding error of complex64."""
         asked = self.settings.tolerance, self.settings.hologram.tolerance
-        least = min((each for each in asked if each is not None), default=1.0)
+        least = min((error for error in asked if error is not None), default=1.0)
         return torch.complex128 if least < _SINGLE else torch.complex64
 
     @cached_property

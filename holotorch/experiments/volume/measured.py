@@ -92,8 +92,8 @@ def _brightest(experiment: VolumeExperiment, colour: int, count: int) -> list[tu
         for j, plane in enumerate(experiment.layers().amplitudes()):
             light = plane[colour].abs().square().sum().item()
             if len(kept) < count or light > kept[-1][0]:
-                kept = sorted([*kept, (light, j, plane[colour].clone())], key=lambda each: -each[0])[:count]
-    return [(j, plane) for _, j, plane in sorted(kept, key=lambda each: each[1])]
+                kept = sorted([*kept, (light, j, plane[colour].clone())], key=lambda candidate: -candidate[0])[:count]
+    return [(j, plane) for _, j, plane in sorted(kept, key=lambda candidate: candidate[1])]
 
 
 def relative_error(field: Tensor, exact: Tensor) -> float:

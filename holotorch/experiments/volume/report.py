@@ -35,7 +35,7 @@ def volume_section(record: RunRecord) -> list[str]:
     rows = [
         [name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "warnings", "holograms")
     ]
-    rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
+    rows += [[f"{hologram['wavelength_nm']:.0f} nm", plain(hologram)] for hologram in plan["holograms"]]
     parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
     return parts + [element("p", note, "warn") for note in plan["notes"]]
 

@@ -158,7 +158,7 @@ class Lens(Transmission):
         if len(given) != len(wavelengths):
             wanted = f"one number or one per wavelength ({len(wavelengths)})"
             raise ValueError(f"focal_length must be {wanted}, got {len(given)}")
-        lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
+        lengths = [checks.quantity(FOCAL_LENGTH, length) for length in given]
         edge = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
         affordable("a lens", grid, len(wavelengths))
         super().__init__(grid, wavelengths, None)

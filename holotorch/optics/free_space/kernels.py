@@ -101,7 +101,7 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
     Raises ValueError for a padded extent below twice ``reach``.
     """
     weights = torch.ones((), dtype=torch.float64)
-    sines = [wavelength * each for each in grid.frequencies()]
+    sines = [wavelength * frequency for frequency in grid.frequencies()]
     steepest = [wavelength * (size // 2) / (size * pitch) for size, pitch in zip(grid.shape, grid.pitch, strict=True)]
     for axis, (extent, start, size) in enumerate(zip(grid.extent, reach, grid.shape, strict=True)):
         if size == 1:

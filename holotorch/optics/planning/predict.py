@@ -162,7 +162,7 @@ class AxisContent:
     def _levelled(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
         """Taps [K, n + m - 1]: Fresnel taps moved by ``shift`` [K, 1] metres, times the factor beyond Fresnel."""
         index = tap_indices(padded, self.size, self.window)
-        taps = torch.stack([self._fresnel(index + each / self.pitch) for each in shift[:, 0]])
+        taps = torch.stack([self._fresnel(index + offset / self.pitch) for offset in shift[:, 0]])
         factor = self._levelled_factor(padded, other, shift)
         return torch.fft.ifft(torch.fft.fft(taps) * factor)[:, self._shifts % padded]
 

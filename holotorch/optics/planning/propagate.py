@@ -97,7 +97,7 @@ def propagate(
     """
     norms = _checked_norms(field, grid)
     call = grid, wavelength, distance, plan, tolerance, out_grid, offset, tilt, band, spread, margin
-    tensors = any(isinstance(each, Tensor) for each in (wavelength, distance, tilt))
+    tensors = any(isinstance(value, Tensor) for value in (wavelength, distance, tilt))
     if measure or tensors or torch.compiler.is_compiling():
         job = _prepared(*call, field.dtype, field.device, example=field if measure else None)
     else:

@@ -262,7 +262,7 @@ def collapse_factors(
     paraxial: bool,
 ) -> list[CollapseFactors]:
     """Factors of :func:`propagate_collapsed` for each wavelength, on the device and in the dtype of ``like``."""
-    return [_factors(like, grid, each, display, eye, plane, sizes, paraxial) for each in wavelengths]
+    return [_factors(like, grid, wavelength, display, eye, plane, sizes, paraxial) for wavelength in wavelengths]
 
 
 def _factors(
@@ -292,7 +292,7 @@ def _factors(
     chirp_factors = [] if sizes.plain else chirps(grid, padded, fine, (0.0, 0.0), device)
     zoom = [(a.to(dtype), b.to(dtype), c.to(dtype)) for a, b, c in chirp_factors]
     rate = torch.as_tensor(first / second, dtype=torch.float64, device=device) / (2 * wavelength)
-    curvature = [cycles_phasor(rate * each.square()).to(dtype) for each in fine.coordinates(device)]
+    curvature = [cycles_phasor(rate * coordinate.square()).to(dtype) for coordinate in fine.coordinates(device)]
     bands = pupil_bands(grid, wavelength, display, eye, plane)
     # The positions (eta, xi) on the pupil of the frequencies of the spectrum. The window has the same width at both
     # pitches and therefore the same frequency step.

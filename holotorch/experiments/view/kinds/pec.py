@@ -63,7 +63,7 @@ class PECViewer(Viewer):
         if distances:
             near, far = 1e3 * min(distances), 1e3 * max(distances)
             low, high = (end + part * abs(end) for end, part in ((near, -0.5), (far, 0.5)))
-            listed = ", ".join(f"{1e3 * each:g}" for each in distances)
+            listed = ", ".join(f"{1e3 * distance:g}" for distance in distances)
             controls.append(
                 Slider(
                     "distance",
@@ -109,7 +109,7 @@ class PECViewer(Viewer):
     def _at_distance(self, distance: float | None) -> PECExperiment:
         """The experiment with its image at one distance in millimetres; unchanged for that of the configuration."""
         experiment = self._experiment
-        meant = [1e3 * each for each in experiment.distances]
+        meant = [1e3 * distance for distance in experiment.distances]
         if distance is None or meant == [distance]:
             return experiment
         settings = experiment.settings

@@ -60,13 +60,13 @@ class Refocuser:
         images = frames.real.new_zeros(len(light), *self.grid.shape)
         for c, wavelength in enumerate(light):
             kernel = cycles_phasor(view.focus * self._axial_frequency(wavelength)).to(frames.dtype)
-            for each in frames:  # one by one, to save memory
-                images[c] += intensity(ifft2(multiply_even(each[c].clone(), kernel), self.grid.shape))
+            for spectrum in frames:  # one by one, to save memory
+                images[c] += intensity(ifft2(multiply_even(spectrum[c].clone(), kernel), self.grid.shape))
         return images / len(frames)
 
     def share(self) -> list[float]:
         """Share of the light of each colour that enters the pupil of the last view."""
-        inside, whole = (intensity(each).sum((0, -2, -1)) for each in (self._spectrum, self._fields))
+        inside, whole = (intensity(field).sum((0, -2, -1)) for field in (self._spectrum, self._fields))
         return (inside / whole.clamp(min=1e-30) / math.prod(self.padded.shape)).tolist()
 
     def _within(self, padded: Grid, light: tuple[float, ...], pupil: View) -> Tensor:
