@@ -36,6 +36,6 @@ def load_heat_kernel(path: Path | str) -> Tensor:
             raise ValueError(f"got {values.dtype} of shape {values.shape}")
     except (ValueError, OSError, EOFError, MemoryError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        wanted = "expected a table of temperature rises, a line for each row of pixels"
-        raise ValueError(f"{path}: {wanted}: {reason}") from None
+        expected = "expected a table of temperature rises, a line for each row of pixels"
+        raise ValueError(f"{path}: {expected}: {reason}") from None
     return torch.from_numpy(values.astype(np.float64))

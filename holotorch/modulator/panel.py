@@ -41,8 +41,8 @@ def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
     circle = torch.cat([circle[-1:] - math.tau, circle, circle[:1] + math.tau])
     order = torch.cat([order[-1:], order, order[:1]])
     borders = ((circle[1:] + circle[:-1]) / 2).to(phase.device)
-    wanted = torch.remainder(phase.detach().double(), math.tau).contiguous()
-    return order.to(phase.device)[torch.bucketize(wanted, borders)]
+    target = torch.remainder(phase.detach().double(), math.tau).contiguous()
+    return order.to(phase.device)[torch.bucketize(target, borders)]
 
 
 def snapped(phase: Tensor, lut: Tensor) -> Tensor:
@@ -244,15 +244,15 @@ def level_of(phase: Tensor, lut: Tensor) -> Tensor:
     Raises ValueError for phases outside the range of the table.
     """
     sign = 1 if lut[-1] >= lut[0] else -1
-    table, wanted = sign * lut.double(), sign * phase.double()
+    table, target = sign * lut.double(), sign * phase.double()
     low, high = table.detach()[0], table.detach()[-1]
-    if bool(((wanted.detach() < low) | (wanted.detach() > high)).any()):
+    if bool(((target.detach() < low) | (target.detach() > high)).any()):
         raise ValueError(
             f"phases must lie in the table's range, {lut.min().item():g} to {lut.max().item():g} rad, got "
             f"{phase.min().item():g} to {phase.max().item():g}"
         )
-    row = torch.bucketize(wanted.detach(), table.detach()).clamp(1, len(table) - 1)
-    return row - 1 + (wanted - table[row - 1]) / (table[row] - table[row - 1])
+    row = torch.bucketize(target.detach(), table.detach()).clamp(1, len(table) - 1)
+    return row - 1 + (target - table[row - 1]) / (table[row] - table[row - 1])
 
 
 def _fraction(name: str, value: float, *, allow_zero: bool = False) -> float:

@@ -121,9 +121,9 @@ class Observer:
             half_width = self.scene.width / 2
             light = pupil_illumination(self.scene.grid, wavelength, self.display, eye, reach=half_width)
             if not light.path_difference:
-                words = f"no light of {wavelength * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
+                problem = f"no light of {wavelength * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
                 hint = "change the distances of display, or the pupil"
-                raise ConfigError([f"display: {words} {depth * 1e3:.4g} mm from the hologram; {hint}"])
+                raise ConfigError([f"display: {problem} {depth * 1e3:.4g} mm from the hologram; {hint}"])
             spectrum = PRESETS[source](wavelength)
             samples = spectrum.samples(tolerance=tolerance, path_difference=light.path_difference, iris=False)
             count = (
@@ -257,8 +257,8 @@ def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Obse
     """
     pitch, longest = min(scene_settings.hologram.pitch), max(scene_settings.wavelengths)
     if pitch <= longest / 2:
-        words = f"expected more than {longest / 2:.4g} m, half the longest wavelength, got {pitch:g} m"
-        raise ConfigError([f"hologram.pitch: {words}"])
+        problem = f"expected more than {longest / 2:.4g} m, half the longest wavelength, got {pitch:g} m"
+        raise ConfigError([f"hologram.pitch: {problem}"])
     budget = observer_budget(settings, scene_settings)
     # The scene is not refocused, so that its tolerance is that of its hologram alone.
     hologram = scene_settings.hologram.model_copy(update={"tolerance": budget.share(HOLOGRAM)})

@@ -91,7 +91,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
         f"the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near "
         f"end, {spots[1]} um at the far end",
     ]
-    return [*lines, *(f"WARNING    {words}" for words in warnings(values))]
+    return [*lines, *(f"WARNING    {warning}" for warning in warnings(values))]
 
 
 def warnings(values: dict[str, Any]) -> list[str]:

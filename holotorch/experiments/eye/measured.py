@@ -17,8 +17,8 @@ def observer_errors(eye: Observer) -> list[Comparison]:
 
     The error of the propagation to the retina is not measured, since its prediction excludes shifts of the picture.
     """
-    words = "not measured: the prediction excludes shifts of the picture; for points of light see holotorch chart eye"
-    retina = Comparison(RETINA, eye.budget.error(RETINA), None, words)
+    note = "not measured: the prediction excludes shifts of the picture; for points of light see holotorch chart eye"
+    retina = Comparison(RETINA, eye.budget.error(RETINA), None, note)
     return [hologram_error(eye.scene), wavelength_error(eye), retina]
 
 
@@ -52,5 +52,5 @@ def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
     ]
     error = relative_error(*(pooled(image, eye.scene.stride) for image in images))
     name = source.replace("_", " ")
-    words = f"{few[2]} propagated of {len(few[0])} for the {name} at {wavelength * 1e9:.0f} nm, against all"
-    return Comparison(WAVELENGTHS, predicted, error, f"{words} {len(lengths)} in steps of 1 nm")
+    note = f"{few[2]} propagated of {len(few[0])} for the {name} at {wavelength * 1e9:.0f} nm, against all"
+    return Comparison(WAVELENGTHS, predicted, error, f"{note} {len(lengths)} in steps of 1 nm")

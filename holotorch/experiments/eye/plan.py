@@ -93,10 +93,10 @@ def _shallow(eye: Observer) -> list[str]:
 def _scene(eye: Observer) -> str:
     """The volume in words: that of the configuration with the view of the scene, or the volume of the scene."""
     scene, own = eye.settings.scene.config, eye.settings.volume
-    words = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
+    source = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
     if changes := eye.settings.scene.change:
-        words += f" and scene.change: {', '.join(changes)}"
-    return "; ".join(filter(None, (words, volume_plan.preset_note(eye.scene))))
+        source += f" and scene.change: {', '.join(changes)}"
+    return "; ".join(filter(None, (source, volume_plan.preset_note(eye.scene))))
 
 
 def plan_text(eye: Observer, values: dict[str, Any]) -> str:
@@ -145,7 +145,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  in addition, at {where} mm, by collapsed propagation; the cost above excludes it")
     first = len(eye_geometry.warnings(values["geometry"]))  # printed above, with the numbers of the geometry
-    return "\n".join([*lines, *(f"WARNING    {words}" for words in values["warnings"][first:])])
+    return "\n".join([*lines, *(f"WARNING    {warning}" for warning in values["warnings"][first:])])
 
 
 def too_large(values: dict[str, Any]) -> str | None:

@@ -56,7 +56,7 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     }
     scene = scene.model_copy(update=own)
     if problems := contradictions(scene):
-        raise ConfigError([f"{'.'.join(map(str, key))}: {words}" for key, words in problems])
+        raise ConfigError([f"{'.'.join(map(str, key))}: {problem}" for key, problem in problems])
     return scene
 
 

@@ -49,9 +49,9 @@ class MeasuredCatheter:
         save_catheter(path, self.catheter)
 
 
-def known_distances(words: Sequence[str]) -> list[int | tuple[int, int]]:
+def known_distances(arguments: Sequence[str]) -> list[int | tuple[int, int]]:
     """Known distances from words: ``i`` for edge i and the tip, ``i-j`` for two edges, counted from 0."""
-    parts = [[int(number) for number in word.split("-")] for word in words]
+    parts = [[int(number) for number in word.split("-")] for word in arguments]
     return [part[0] if len(part) == 1 else (part[0], part[1]) for part in parts]
 
 

@@ -113,7 +113,7 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     if settings.protocol == "tone":  # photographs, which show no catheter
         tracks = [Track(source, Log(folder.path / "images")) for source in experiment.sources]
     else:
-        tracks = [_followed(settings, source, folder, files, i) for i, source in enumerate(experiment.sources)]
+        tracks = [_tracked(settings, source, folder, files, i) for i, source in enumerate(experiment.sources)]
     summary: dict[str, Any] = {"experiment": "measure", "status": "", "protocol": settings.protocol}
     summary |= {"sources": [source.name for source in experiment.sources]}
     summary |= {"frames": sum(len(track.poses) for track in tracks)}
@@ -136,7 +136,7 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     return complete
 
 
-def _followed(settings: MeasureSettings, source: Source, folder: RunFolder, files: Results, number: int) -> Track:
+def _tracked(settings: MeasureSettings, source: Source, folder: RunFolder, files: Results, number: int) -> Track:
     """The track of a source; its poses and YAML files are written if they were tracked from frames."""
     track = Track(source, Log(folder.path / "images"))
     guide = Guide(settings, Grid.of(settings)) if source.live and settings.protocol in GRIDS else None

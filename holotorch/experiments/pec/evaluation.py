@@ -105,7 +105,7 @@ def speckle_spots(experiment: PECExperiment, phase: Tensor) -> Tensor:
 
 
 def _spots(experiment: PECExperiment, formed: Tensor) -> Tensor:
-    return dark_spots(formed / formed.mean((-2, -1), keepdim=True), experiment.wanted)
+    return dark_spots(formed / formed.mean((-2, -1), keepdim=True), experiment.normalised)
 
 
 def _efficiency(experiment: PECExperiment, formed: Tensor) -> list[float]:
@@ -115,7 +115,7 @@ def _efficiency(experiment: PECExperiment, formed: Tensor) -> list[float]:
 
 def _scale(experiment: PECExperiment, formed: Tensor) -> Tensor:
     """Factors [C, 1, 1] that fit an intensity [C, h, w] to the target by least squares."""
-    return best_scale(formed, experiment.wanted)[:, None, None]
+    return best_scale(formed, experiment.normalised)[:, None, None]
 
 
 def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
@@ -140,8 +140,8 @@ def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any
     """Scores of the intensity midway between four samples, against the mean of the four pixels of the target."""
     picture = _as_picture(experiment, between, at_best_scale=False)[..., :-1, :-1]
     image = experiment.image
-    wanted = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
-    return _scores(experiment, picture, wanted) if min(wanted.shape[-2:]) >= SSIM_WINDOW else {}
+    reference = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
+    return _scores(experiment, picture, reference) if min(reference.shape[-2:]) >= SSIM_WINDOW else {}
 
 
 def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[str, Any]:

@@ -173,7 +173,7 @@ class Bench:
         formed = self.formed(phase) if formed is None else formed
         image, light = self.experiment.image, formed.sum((-2, -1)) / math.prod(self.shape)
         if self.experiment.scale_free:
-            formed = formed * best_scale(formed, self.experiment.wanted)[:, None, None]
+            formed = formed * best_scale(formed, self.experiment.normalised)[:, None, None]
         picture = (formed * image.mean((-2, -1), keepdim=True)).clamp(0, 1)
         single = ssim(picture, image, data_range=1.0).reshape(-1, self.channels).mean(1)  # of each photograph
         scores = {

@@ -73,8 +73,8 @@ class Machine:
         return (2 if double else 1) * values * _SCORE[values > _CACHED] * self.elementwise
 
     def __str__(self) -> str:
-        words = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in asdict(self).items())
-        return f"times relative to the reference machine: {words}"
+        speeds = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in asdict(self).items())
+        return f"times relative to the reference machine: {speeds}"
 
 
 def seconds_in_words(seconds: dict[str, float]) -> str:

@@ -113,8 +113,8 @@ def _verdict(
     for name in dict.fromkeys(row["task"] for row in model):
         own = [row for row in model if row["task"] == name]
         best = max(own, key=lambda row: float(row["speedup"]))
-        words = ", ".join(f"{row['speedup']} on {row['gpus']}" for row in own)
-        lines.append(f"{MODEL}: {name}: {words}; fastest on {best['gpus']} GPUs")
+        speedups = ", ".join(f"{row['speedup']} on {row['gpus']}" for row in own)
+        lines.append(f"{MODEL}: {name}: {speedups}; fastest on {best['gpus']} GPUs")
     return lines
 
 

@@ -36,9 +36,9 @@ def sweeps() -> list[Sweep]:
               lambda z: _many(z, 10e-9), TOLERANCE, ASKED),
         Sweep("Spectrum.samples", "tolerance", tolerances, lambda t: _few(10e-3, t, 10e-9),
               lambda _: _many(10e-3, 10e-9), tolerance_from=ASKED),
-        Sweep("SpectralRetina", "width (m)", widths, partial(_followed, TOLERANCE),
+        Sweep("SpectralRetina", "width (m)", widths, partial(_propagated, TOLERANCE),
               partial(_each, TOLERANCE), TOLERANCE, ASKED),
-        Sweep("SpectralRetina", "tolerance", tolerances, lambda t: _followed(t, 20e-9), lambda t: _each(t, 20e-9),
+        Sweep("SpectralRetina", "tolerance", tolerances, lambda t: _propagated(t, 20e-9), lambda t: _each(t, 20e-9),
               tolerance_from=ASKED),
     ]  # fmt: skip
 
@@ -77,7 +77,7 @@ def _inside() -> Tensor:
     return (reference.noise(GRID.shape) * inside)[None]
 
 
-def _followed(tolerance: float, fwhm: float) -> Answer:
+def _propagated(tolerance: float, fwhm: float) -> Answer:
     """The image [1, H, W] with as many wavelengths propagated as the tolerance requires.
 
     The error of the propagation of each wavelength is left to ``Retina`` and is the same in the reference.

@@ -17,9 +17,9 @@ from holotorch.experiments.sweep.points import Point, points
 from holotorch.experiments.sweep.results import PAGE, TABLE, finished, write_results
 
 
-def check_sweep(config: str, words: Sequence[str]) -> str:
+def check_sweep(config: str, arguments: Sequence[str]) -> str:
     """The number of runs and their predicted cost in words. ConfigError with the mistakes of all runs."""
-    grid = points(words)
+    grid = points(arguments)
     settings = _validated(config, grid)
     times, memory, shortages = [], 0.0, []
     for setting in tqdm(settings, desc="planning", unit="run", disable=None):
@@ -37,7 +37,7 @@ def check_sweep(config: str, words: Sequence[str]) -> str:
 
 
 def run_sweep(
-    config: str, words: Sequence[str], out: Path, *, jobs: int = 1, slurm: Sequence[str] | None = None
+    config: str, arguments: Sequence[str], out: Path, *, jobs: int = 1, slurm: Sequence[str] | None = None
 ) -> int:
     """Carry out the missing runs of a sweep, write its table, picture and page, and return the exit status.
 
@@ -46,7 +46,7 @@ def run_sweep(
     """
     if jobs < 1:
         raise ConfigError([f"--jobs: expected 1 or more, got {jobs}"])
-    grid = points(words)
+    grid = points(arguments)
     settings = _validated(config, grid)
     missing = [point for point, each in zip(grid, settings, strict=True) if not _complete(out / point.name, each)]
     out.mkdir(parents=True, exist_ok=True)

@@ -78,8 +78,8 @@ def axes_matrix(axes: str) -> Tensor:
     letters = [_LETTERS.get(letter) for letter in axes.upper()]
     known = [letter for letter in letters if letter is not None]
     if len(axes) != 3 or sorted(axis for axis, _ in known) != [0, 1, 2]:
-        words = "one of R L, one of U D and one of F B, such as RDF, RUB (WebXR) or RUF (Unity)"
-        raise ConfigError([f"--axes: expected {words}, got {axes!r}"])
+        expected = "one of R L, one of U D and one of F B, such as RDF, RUB (WebXR) or RUF (Unity)"
+        raise ConfigError([f"--axes: expected {expected}, got {axes!r}"])
     matrix = torch.zeros(3, 3, dtype=torch.float64)
     for column, (axis, sign) in enumerate(known):
         matrix[axis, column] = sign

@@ -141,8 +141,8 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
 
 def verdict(summary: dict[str, Any]) -> str:
     """The summary in one line."""
-    words = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
-    text = f"Frames     {summary['answered']} of {summary['frames']} with a pose ({words})"
+    statuses = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
+    text = f"Frames     {summary['answered']} of {summary['frames']} with a pose ({statuses})"
     if "milliseconds" in summary:
         text += f"; {summary['milliseconds']['median']:.1f} ms each, slowest {summary['milliseconds']['largest']:.1f}"
     if "stability" in summary:

@@ -71,8 +71,8 @@ def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: floa
     predicted = plan_propagation(*scene, tolerance=tolerance, dtype=experiment.dtype).predicted_error
     plan = plan_propagation(*scene, tolerance=_TIGHT, dtype=torch.complex128)
     if plan.predicted_error > predicted / 2:
-        words = f"not measured: the most exact method itself is predicted to err by {plan.predicted_error:.1e}"
-        return Comparison(REFOCUSING, predicted, None, words)
+        note = f"not measured: the most exact method itself is predicted to err by {plan.predicted_error:.1e}"
+        return Comparison(REFOCUSING, predicted, None, note)
     seconds = _DOUBLE * FLOP_SECONDS * plan.flops
     if seconds > limit:
         speed = machine_speed(experiment.device).fft(math.prod(plan.padded))
@@ -81,8 +81,8 @@ def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: floa
     with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the note states the error
         exact = refocused(hologram[middle].to(torch.complex128), *setup, tolerance=_TIGHT)
     error = relative_error(refocused(hologram[middle].to(experiment.dtype), *setup, tolerance=tolerance), exact)
-    words = f"{wavelength * 1e9:.0f} nm at {depth * 1e3:.4g} mm, against complex128 within {plan.predicted_error:.0e}"
-    return Comparison(REFOCUSING, predicted, error, words)
+    note = f"{wavelength * 1e9:.0f} nm at {depth * 1e3:.4g} mm, against complex128 within {plan.predicted_error:.0e}"
+    return Comparison(REFOCUSING, predicted, error, note)
 
 
 def _brightest(experiment: VolumeExperiment, colour: int, count: int) -> list[tuple[int, Tensor]]:

@@ -136,7 +136,7 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     lines += [f"Note       {note}" for note in values["notes"]]
-    lines += [f"WARNING    {words}" for words in values["warnings"]]
+    lines += [f"WARNING    {warning}" for warning in values["warnings"]]
     return "\n".join(lines)
 
 

@@ -156,8 +156,8 @@ class Lens(Transmission):
         numbers = focal_length.detach().tolist() if isinstance(focal_length, Tensor) else focal_length
         given = list(numbers) if isinstance(numbers, Sequence) else [numbers] * len(wavelengths)
         if len(given) != len(wavelengths):
-            wanted = f"one number or one per wavelength ({len(wavelengths)})"
-            raise ValueError(f"focal_length must be {wanted}, got {len(given)}")
+            expected = f"one number or one per wavelength ({len(wavelengths)})"
+            raise ValueError(f"focal_length must be {expected}, got {len(given)}")
         lengths = [checks.quantity(FOCAL_LENGTH, length) for length in given]
         edge = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
         affordable("a lens", grid, len(wavelengths))

@@ -98,10 +98,10 @@ class PECViewer(Viewer):
             pictures = self._maps(phase if heaters else warm, "rad" if heaters else "degC")
             return Shown(pictures, numbers)
         picture, scores = observed(experiment, phase)
-        words = {"ssim": "SSIM", "psnr": "PSNR"}
+        names = {"ssim": "SSIM", "psnr": "PSNR"}
         for name in experiment.settings.report.metrics:
             if (value := scores[f"{name}_mean"]) is not None:
-                numbers[words[name]] = f"{value:.3f}" if name == "ssim" else f"{value:.1f} dB"
+                numbers[names[name]] = f"{value:.3f}" if name == "ssim" else f"{value:.1f} dB"
         efficiency = [share for share in scores["efficiency"] if share > 0]
         numbers["light in the picture"] = percent(sum(efficiency) / max(1, len(efficiency)))
         return Shown([Picture.of("shown", "On the screen", picture), self._target], numbers)
