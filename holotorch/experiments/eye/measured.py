@@ -22,11 +22,10 @@ def observer_errors(eye: Observer) -> list[Comparison]:
     return [hologram_error(eye.scene), wavelength_error(eye), retina]
 
 
-def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
+def wavelength_error(eye: Observer) -> Comparison:
     """Error of the picture of the widest source, for the middle colour and focus and the first realisation.
 
-    In the reference each wavelength in steps of 1 nm is propagated, by the method of the plan. ``limit`` is in seconds
-    on the reference machine of ``planning.machine``.
+    In the reference each wavelength in steps of 1 nm is propagated, by the method of the plan.
     """
     colour = len(eye.scene.settings.wavelengths) // 2
     depth, wavelength = eye.focus[len(eye.focus) // 2], eye.scene.settings.wavelengths[colour]
@@ -41,7 +40,7 @@ def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
         pictures = plan.flops * FLOP_SECONDS[plan.method] * len(lengths)
         return hologram_seconds(eye.scene, machine) + pictures * machine.fft(plan.memory_bytes / 8)
 
-    if seconds(Machine()) > limit:
+    if seconds(Machine()) > LIMIT:
         return not_measured(WAVELENGTHS, predicted, seconds(machine_speed(eye.scene.device)))
     few = eye.samples(source, wavelength, depth)
     light = eye.scene.hologram(eye.settings.seed)[0][colour].conj()

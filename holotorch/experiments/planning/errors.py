@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-LIMIT = 30.0  # longest time of a measurement, in seconds on the reference machine of ``machine``
+# Longest time of a measurement, in seconds on the reference machine of ``machine``: every machine measures the same.
+LIMIT = 30.0
 
 
 @dataclass(frozen=True)

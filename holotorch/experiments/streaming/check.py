@@ -247,9 +247,9 @@ class Relay(UdpSocket):
         newest: Largest number of a forwarded packet; packets are numbered in the order of arrival.
     """
 
-    def __init__(self, port: int, seed: int = 7):
+    def __init__(self, port: int):
         super().__init__(0, _LOOPBACK)
-        self._to, self._random = (_LOOPBACK, port), random.Random(seed)
+        self._to, self._random = (_LOOPBACK, port), random.Random(7)
         self.came, self.dropped, self.overtaken, self.repeated, self.newest = 0, 0, 0, 0, -1
         self._delayed: list[tuple[int, int, bytes]] = []  # number of the packet at which it is due, its number, content
 

@@ -20,15 +20,10 @@ _DOUBLE = 2.0  # time of complex128 over that of complex64
 _TIGHT = 1e-7  # tolerance of the reference of refocusing
 
 
-def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Comparison:
+def hologram_error(experiment: VolumeExperiment) -> Comparison:
     """Error of the colour with the largest predicted error, for the light of its brightest planes.
 
     Their hologram by the method of the plan is compared with a convolution of each plane in complex128.
-
-    Args:
-        experiment: The experiment.
-        limit: Seconds that a reference may take on the reference machine of ``planning.machine``; since it is not this
-            machine, the same is measured everywhere.
     """
     colour = max(range(len(experiment.plans)), key=lambda c: experiment.plans[c].predicted_error)
     plan, wavelength = experiment.plans[colour], experiment.settings.wavelengths[colour]
@@ -43,7 +38,7 @@ def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Compar
         return rendering_seconds(experiment, machine) + FLOP_SECONDS * flops * machine.fft(math.prod(plan.size))
 
     count = min(_PLANES, len(experiment.depths))
-    while count and seconds(Machine(), count) > limit:
+    while count and seconds(Machine(), count) > LIMIT:
         count -= 1
     if not count:
         return not_measured(HOLOGRAM, plan.predicted_error, seconds(machine_speed(experiment.device), 1))
@@ -59,7 +54,7 @@ def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Compar
     return Comparison(HOLOGRAM, plan.predicted_error, relative_error(*fields), note)
 
 
-def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: float, limit: float = LIMIT) -> Comparison:
+def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: float) -> Comparison:
     """Error of refocusing the middle colour of ``hologram`` [C, H, W] at a depth in metres.
 
     The reference is propagated in complex128 within the smallest tolerance that some method reaches.
@@ -74,7 +69,7 @@ def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: floa
         note = f"not measured: the most exact method itself is predicted to err by {plan.predicted_error:.1e}"
         return Comparison(REFOCUSING, predicted, None, note)
     seconds = _DOUBLE * FLOP_SECONDS * plan.flops
-    if seconds > limit:
+    if seconds > LIMIT:
         speed = machine_speed(experiment.device).fft(math.prod(plan.padded))
         return not_measured(REFOCUSING, predicted, seconds * speed)
     setup = experiment.grid, wavelength, depth
