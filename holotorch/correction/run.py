@@ -168,9 +168,8 @@ class Run:
         last, self.any_active = self.loss, any_active
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
-        self.x = torch.where(
-            self.expanded(self.active), x, self.x
-        )  # unconditional, since a test would wait for the GPU
+        # Unconditional, since a test would wait for the GPU.
+        self.x = torch.where(self.expanded(self.active), x, self.x)
         loss = torch.where(self.active, loss, last)
         self.calm = self._calm(loss)
         self.step += 1

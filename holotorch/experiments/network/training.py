@@ -33,9 +33,8 @@ class Crops(Dataset[Tensor]):
     def __getitem__(self, index: int) -> Tensor:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + index)
         picture = self.pictures[index % len(self.pictures)]
-        top, left = (
-            int(torch.randint(n - self.size + 1, (), generator=generator)) for n in picture.shape
-        )  # the same for every access
+        # The same for every access.
+        top, left = (int(torch.randint(n - self.size + 1, (), generator=generator)) for n in picture.shape)
         crop = picture[top : top + self.size, left : left + self.size]
         crop = crop.flip(-1) if index % 2 else crop
         return (crop / crop.mean().clamp(min=1e-3))[None]

@@ -24,10 +24,8 @@ _RAY_BYTES = 120  # memory of the renderer per ray
 _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
-_LIT, _DARK = (
-    0.05,
-    0.1,
-)  # value above which a ray is not black, and share of such rays below which a picture counts as mostly black
+_LIT = 0.05  # value above which a ray is not black
+_DARK = 0.1  # share of such rays below which a picture counts as mostly black
 
 
 def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
