@@ -136,18 +136,18 @@ def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:
             raise ValueError(f"{name or kind.name} {problem}")
 
 
-def whole(name: str, value: int, least: int) -> int:
-    """Return ``value`` as int, or raise TypeError unless it is an integer and ValueError if it is below ``least``."""
+def whole(name: str, value: int, minimum: int) -> int:
+    """Return ``value`` as int, or raise TypeError unless it is an integer and ValueError if it is below ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name} must be a whole number, got {type(value).__name__} {value!r}")
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value!r}")
+    if value < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {value!r}")
     return int(value)
 
 
-def port(value: int, least: int = 0) -> int:
-    """Return the number of a TCP or UDP port as int, or raise unless it lies in ``least`` .. 65535."""
-    if whole("port", value, least) > 65535:
+def port(value: int, minimum: int = 0) -> int:
+    """Return the number of a TCP or UDP port as int, or raise unless it lies in ``minimum`` .. 65535."""
+    if whole("port", value, minimum) > 65535:
         raise ValueError(f"port must be at most 65535, got {value!r}")
     return int(value)
 

@@ -73,12 +73,12 @@ def number(value: Any) -> Any:
     return value
 
 
-def within(least: float, most: float, words: str) -> AfterValidator:
-    """A validator of the range from ``least`` to ``most``, which ``words`` describe in the message."""
+def within(minimum: float, maximum: float, expected: str) -> AfterValidator:
+    """A validator of the range from ``minimum`` to ``maximum``, which ``expected`` describes in the message."""
 
     def check(value: float) -> float:
-        if not least <= value <= most:
-            raise PydanticCustomError("range", "expected {words}", {"words": words})
+        if not minimum <= value <= maximum:
+            raise PydanticCustomError("range", "expected {words}", {"words": expected})
         return value
 
     return AfterValidator(check)

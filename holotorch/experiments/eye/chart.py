@@ -110,11 +110,11 @@ def _methods(observer: Observer) -> list[dict]:
     return rows
 
 
-def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
-    """The sampling ``least`` with ``factor`` times as many samples along each axis."""
-    fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in least.fine)
-    times = tuple(m * now / size for m, now, size in zip(least.oversampling, fine, least.fine, strict=True))
-    return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
+def _scaled(sampling: ElementSampling, factor: float) -> ElementSampling:
+    """``sampling`` with ``factor`` times as many samples along each axis."""
+    fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in sampling.fine)
+    times = tuple(m * now / size for m, now, size in zip(sampling.oversampling, fine, sampling.fine, strict=True))
+    return replace(sampling, oversampling=times, fine=fine)  # type: ignore[arg-type]
 
 
 def _counts(observer: Observer, amount: Amount) -> list[dict]:

@@ -13,9 +13,9 @@ from holotorch.metrics import anisotropy, grain_size, power_spectrum
 _RINGS = 24  # number of rings of a radial mean of the spectrum
 
 
-def relative_speckle(pictures: Tensor, reference: Tensor, least: Tensor) -> Tensor:
-    """``pictures`` [..., h, w] divided by the speckle-free ``reference``; 1 where that is at most ``least``."""
-    lit = reference > least
+def relative_speckle(pictures: Tensor, reference: Tensor, minimum: Tensor) -> Tensor:
+    """``pictures`` [..., h, w] divided by the speckle-free ``reference``; 1 where that is at most ``minimum``."""
+    lit = reference > minimum
     return torch.where(lit, pictures / torch.where(lit, reference, 1), 1)
 
 

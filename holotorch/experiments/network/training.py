@@ -40,9 +40,9 @@ class Crops(Dataset[Tensor]):
         return (crop / crop.mean().clamp(min=1e-3))[None]
 
 
-def _halved(picture: Tensor, least: int) -> Tensor:
-    """``picture`` [H, W] at half its resolution as often as both sides stay at least ``least`` pixels."""
-    while min(picture.shape) >= 2 * least:
+def _halved(picture: Tensor, minimum: int) -> Tensor:
+    """``picture`` [H, W] at half its resolution as often as both sides stay at least ``minimum`` pixels."""
+    while min(picture.shape) >= 2 * minimum:
         picture = nn.functional.avg_pool2d(picture[None], 2)[0]
     return picture
 

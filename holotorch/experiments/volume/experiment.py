@@ -264,12 +264,12 @@ class VolumeExperiment:
         return [depth / self.settings.scale for depth in self.settings.report.refocus or ()]
 
 
-def _joined(depths: Sequence[float], most: int) -> Sequence[float]:
-    """``depths`` if they are at most ``most``; otherwise the means of that many groups of neighbours."""
+def _joined(depths: Sequence[float], limit: int) -> Sequence[float]:
+    """``depths`` if they are at most ``limit``; otherwise the means of that many groups of neighbours."""
     count = len(depths)
-    if count <= most:
+    if count <= limit:
         return depths
-    groups = (depths[count * k // most : count * (k + 1) // most] for k in range(most))
+    groups = (depths[count * k // limit : count * (k + 1) // limit] for k in range(limit))
     return [sum(group) / len(group) for group in groups]
 
 

@@ -352,12 +352,12 @@ def zoom_flops(padded: tuple[int, int], fine: tuple[int, int]) -> float:
     return sum(10 * lines * n * math.log2(n) for lines, n in ((py, px + fx), (fx, py + fy)))
 
 
-def warn_if_coarse(sampling: Sequence[float], least: Sequence[float], sampled: str, aliases: str) -> None:
-    """SamplingWarning in the name of the caller's caller if an oversampling (y, x) is below ``least``."""
-    if any(given < needed * (1 - 1e-9) for given, needed in zip(sampling, least, strict=True)):
+def warn_if_coarse(sampling: Sequence[float], required: Sequence[float], sampled: str, aliases: str) -> None:
+    """SamplingWarning in the name of the caller's caller if an oversampling (y, x) is below ``required``."""
+    if any(given < needed * (1 - 1e-9) for given, needed in zip(sampling, required, strict=True)):
         warnings.warn(
             f"{sampled} sampled {max(sampling):.3g} times as fine as the hologram {aliases}; "
-            f"{max(least):.3g} times would do",
+            f"{max(required):.3g} times would do",
             SamplingWarning,
             stacklevel=3,
         )

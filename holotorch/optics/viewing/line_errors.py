@@ -47,11 +47,11 @@ def noise_lines(grid: Grid) -> Lines:
     return _both_axes(grid, lambda size, pitch: _noise(size))
 
 
-def scene_lines(grid: Grid, wavelength: float, plane: float, reach: float) -> Lines:
-    """Lines of a hologram of white noise that lies in the plane ``plane`` within ``reach`` of the axis, in metres."""
+def scene_lines(grid: Grid, wavelength: float, plane: float, half_width: float) -> Lines:
+    """Lines of a hologram of white noise in the plane ``plane`` within ``half_width`` of the axis, in metres."""
 
     def light(size: int, pitch: float) -> Tensor:
-        points = 2 * math.floor(reach / pitch) + 1
+        points = 2 * math.floor(half_width / pitch) + 1
         enough = samples_for_all_light(points, size, pitch, wavelength, plane)
         padded = Grid((1, good_length(math.ceil(max(enough, points, size)))), pitch)
         kernel = angular_spectrum_kernel(padded, wavelength, -plane, band_limit=False)
@@ -157,11 +157,13 @@ def _of_axis(sampling: Sampling, axis: int) -> Sampling:
     return replace(sampling, **sizes)
 
 
-def _finer(least: ElementSampling, axis: int) -> ElementSampling:
+def _finer(sampling: ElementSampling, axis: int) -> ElementSampling:
     """The sampling of the reference for a line along ``axis``."""
-    padded, fine = _WIDER * least.padded[axis], _FINER * _WIDER * least.fine[axis]
+    padded, fine = _WIDER * sampling.padded[axis], _FINER * _WIDER * sampling.fine[axis]
     return ElementSampling(
-        (1.0, _FINER * least.oversampling[axis]), (1, good_length(math.ceil(padded))), (1, good_length(math.ceil(fine)))
+        (1.0, _FINER * sampling.oversampling[axis]),
+        (1, good_length(math.ceil(padded))),
+        (1, good_length(math.ceil(fine))),
     )
 
 
