@@ -25,12 +25,12 @@ def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None, first: tuple[in
     if 0 in spectrum.shape[:-2]:
         return _resized(spectrum, size)
     field = torch.fft.ifft2(spectrum, norm="forward")
-    for axis, begin, count in zip((-2, -1), first, size or (), strict=False):
-        end, length = begin + count, field.shape[axis]
+    for axis, start, count in zip((-2, -1), first, size or (), strict=False):
+        end, length = start + count, field.shape[axis]
         if end <= length:
-            field = field.narrow(axis, begin, count)
+            field = field.narrow(axis, start, count)
         else:
-            field = torch.cat([field.narrow(axis, begin, length - begin), field.narrow(axis, 0, end - length)], axis)
+            field = torch.cat([field.narrow(axis, start, length - start), field.narrow(axis, 0, end - length)], axis)
     return field * (1 / math.prod(spectrum.shape[-2:]))
 
 

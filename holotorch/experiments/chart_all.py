@@ -52,16 +52,16 @@ def interrupted(outcomes: dict[str, Outcome]) -> bool:
 
 
 def _outcome(subject: str, folder: Path, quick: bool) -> Outcome:
-    begin = time.perf_counter()
+    start = time.perf_counter()
     try:
-        return Outcome(verdict=chart(subject, folder, quick=quick), problem="", seconds=time.perf_counter() - begin)
+        return Outcome(verdict=chart(subject, folder, quick=quick), problem="", seconds=time.perf_counter() - start)
     except KeyboardInterrupt:
         problem = _INTERRUPTED
     except ConfigError as error:
         problem = str(error)
     except Exception as error:  # an error in one subject does not stop the others
         problem = f"{type(error).__name__}: {error}"
-    return Outcome(time.perf_counter() - begin, problem=problem)
+    return Outcome(time.perf_counter() - start, problem=problem)
 
 
 def _page(outcomes: dict[str, Outcome], out: Path, quick: bool) -> str:

@@ -193,7 +193,7 @@ class AxialHologram(LayerHologram):
         for item, layers in zip(field, out, strict=True):
             spectrum = multiply_even(raster.spectrum_of_pixels(item), design.last(0, field).conj())
             for m in range(nodes.count):
-                planes = [j for j, begin in enumerate(begins) if begin <= m < begin + nodes.width]
+                planes = [j for j, start in enumerate(begins) if start <= m < start + nodes.width]
                 layer = raster.layer(spectrum) if planes else spectrum
                 for j in planes:
                     layers[j] += layer * weights[j][m - begins[j]].conjugate()
@@ -287,9 +287,9 @@ class Accumulator:
         self._close(self.open - touched)
         self.open |= touched
         matrix = [[0j] * len(order) for _ in range(self.rows)]
-        for column, (j, begin) in enumerate(zip(order, begins, strict=True)):
+        for column, (j, start) in enumerate(zip(order, begins, strict=True)):
             for k, weight in enumerate(self.weights[j]):
-                matrix[(begin + k) % self.rows][column] = weight
+                matrix[(start + k) % self.rows][column] = weight
         spread = torch.tensor(matrix, dtype=torch.complex128)
         height, _, width = planes.shape
         if self.block is None:
@@ -338,9 +338,9 @@ def _stacked(planes: list[Tensor]) -> Tensor:
     first = planes[0]
     if not checks.readable(*planes):  # nor have they addresses
         return torch.stack(planes, 1)
-    begin, memory = first.data_ptr(), first.untyped_storage().data_ptr()
+    start, memory = first.data_ptr(), first.untyped_storage().data_ptr()
     for k, plane in enumerate(planes):
-        adjacent = plane.untyped_storage().data_ptr() == memory and plane.data_ptr() == begin + k * first.nbytes
+        adjacent = plane.untyped_storage().data_ptr() == memory and plane.data_ptr() == start + k * first.nbytes
         if not (adjacent and plane.is_contiguous()):
             return torch.stack(planes, 1)
     return first.as_strided((len(first), len(planes), first.shape[1]), (first.shape[1], first.numel(), 1))

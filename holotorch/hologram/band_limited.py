@@ -59,8 +59,8 @@ def band_limited_wave(
     columns = 2 * fx[1] * torch.cos(2 * math.pi * dx[:, None] * fx[0])
     rows = 2 * fy[1] * torch.cos(2 * math.pi * dy[:, None] * fy[0])
     total = torch.zeros(len(dy), len(dx), dtype=torch.complex128, device=dy.device)
-    for begin in range(0, len(fy[0]), 256):
-        part = slice(begin, begin + 256)
+    for start in range(0, len(fy[0]), 256):
+        part = slice(start, start + 256)
         spectrum = point_spectrum(fy[0][part, None], fx[0][None], wavelength, depth)
         total += rows[:, part].to(spectrum) @ (spectrum @ columns.T.to(spectrum))
     return total

@@ -56,9 +56,9 @@ def network(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, byte
     problem = PECProblem(crosstalk, propagator, scale_free=True, amplitude=True)
     torch.manual_seed(0)
     model = PhaseUNet(propagator, limit=LIMIT)
-    begin = time.perf_counter()
+    start = time.perf_counter()
     losses = train(model, problem, Crops(trained, GRID.shape[0], amount.crops), steps=amount.training)
-    seconds = time.perf_counter() - begin
+    seconds = time.perf_counter() - start
     pictures = Crops(held, GRID.shape[0], amount.scored * len(held), seed=99)
     rows, shown = [], {}
     for k in tqdm(range(len(pictures)), desc="scoring", unit="picture"):
@@ -117,9 +117,9 @@ def _timed(function) -> tuple[Tensor, float]:
     """The result, and the median of the seconds of a few calls."""
     seconds, result = [], torch.empty(0)
     for _ in range(ROUNDS):
-        begin = time.perf_counter()
+        start = time.perf_counter()
         result = function()
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.perf_counter() - start)
     return result, float(np.median(seconds))
 
 

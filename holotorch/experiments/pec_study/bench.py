@@ -152,11 +152,11 @@ class Bench:
         """Gerchberg-Saxton; ``kind`` is "none", "basic" (crosstalk in the loop) or "ipec" (deconvolution as well)."""
         problem, propagator = self.experiment.problem(), self.experiment.propagator
         target, mask = problem.target, problem.mask
-        begin = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
+        start = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
         if kind == "ipec":
-            return iterative_pec(propagator, self.crosstalk, target, begin, max_steps=PASSES, mask=mask)
+            return iterative_pec(propagator, self.crosstalk, target, start, max_steps=PASSES, mask=mask)
         spread = self.crosstalk if kind == "basic" else None
-        return gerchberg_saxton(propagator, target, begin, max_steps=PASSES, crosstalk=spread, mask=mask)
+        return gerchberg_saxton(propagator, target, start, max_steps=PASSES, crosstalk=spread, mask=mask)
 
     def formed(self, phase: Tensor) -> Tensor:
         """Intensity of the picture, float64 [C, h, w], that the frames of ``phase`` ([F,] C, H, W) form on average."""

@@ -155,8 +155,8 @@ def _measure(device: torch.device) -> Machine:
 
 def _fastest(call: Callable[[], object], device: torch.device) -> float:
     call()  # the first call allocates memory and plans the transform
-    begin, times = time.perf_counter(), []
-    while len(times) < _ROUNDS or (times and time.perf_counter() - begin < _SECONDS):
+    start, times = time.perf_counter(), []
+    while len(times) < _ROUNDS or (times and time.perf_counter() - start < _SECONDS):
         started = time.perf_counter()
         call()
         if device.type == "cuda":

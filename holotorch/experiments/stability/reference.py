@@ -42,8 +42,8 @@ def propagated(
         sines.append(wavelength * f + tilt[axis])
     columns, total = source @ sent[1].T, np.zeros(out.shape, complex)
     step = max(1, _CHUNK // len(sines[1]))
-    for begin in range(0, len(sines[0]), step):
-        rows = slice(begin, begin + step)
+    for start in range(0, len(sines[0]), step):
+        rows = slice(start, start + step)
         root = np.sqrt(1 - sines[0][rows, None] ** 2 - sines[1] ** 2 + 0j)
         # The root is imaginary for evanescent waves, which decay for either sign of the distance.
         phase = 2j * np.pi / wavelength * (distance * root.real + 1j * abs(distance) * root.imag)

@@ -141,13 +141,13 @@ async def _panel(count: int) -> tuple[bool, str]:
         ClientSession() as session,
         session.ws_connect(server.address + "poses") as socket,
     ):
-        begin = now()
-        while len(delays) < count and now() < begin + count / 30 * 4 + 2:
+        start = now()
+        while len(delays) < count and now() < start + count / 30 * 4 + 2:
             with suppress(TimeoutError):
                 message = await asyncio.wait_for(socket.receive(), 1.0)
                 if message.type is WSMsgType.BINARY:
                     delays.append(now() - struct.unpack_from("<d", message.data, 1)[0])
-        rate = len(delays) / (now() - begin)
+        rate = len(delays) / (now() - start)
     median = float(torch.tensor(delays or [math.inf]).median())
     good = median < _PICTURE
     advice = "" if good else f"; above {_PICTURE * 1e3:g} ms: close what keeps this computer busy, and try again"

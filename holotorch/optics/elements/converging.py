@@ -235,10 +235,10 @@ class ConvergingFresnel(FieldOperator):
         low, high = self.offset[axis] - half_out, self.offset[axis] + half_out
         slopes = []
         for q in (-half, half):
-            begin, end = max(low, m * q - spread), min(high, m * q + spread)
-            slopes += [abs(begin - q), abs(end - q)] if begin <= end else []
+            start, end = max(low, m * q - spread), min(high, m * q + spread)
+            slopes += [abs(start - q), abs(end - q)] if start <= end else []
         for x in (low, high) if m else ():
             first, last = sorted(((x - spread) / m, (x + spread) / m))
-            begin, end = max(-half, first), min(half, last)
-            slopes += [abs(x - begin), abs(x - end)] if begin <= end else []
+            start, end = max(-half, first), min(half, last)
+            slopes += [abs(x - start), abs(x - end)] if start <= end else []
         return max(slopes) / abs(self.distance) if slopes else None

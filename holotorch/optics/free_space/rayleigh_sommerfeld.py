@@ -67,10 +67,10 @@ class RayleighSommerfeld(FieldOperator):
 
     def _adjoint(self, field: Tensor) -> Tensor:
         flat = field.to(torch.complex128).flatten(-2)
-        total, begin = torch.zeros(1, dtype=torch.complex128, device=field.device), 0
+        total, start = torch.zeros(1, dtype=torch.complex128, device=field.device), 0
         for kernel in self._kernels(field.device):
-            part = flat[..., begin : begin + kernel.shape[1]]
-            total, begin = total + torch.einsum("...cp,cpq->...cq", part, kernel.conj()), begin + kernel.shape[1]
+            part = flat[..., start : start + kernel.shape[1]]
+            total, start = total + torch.einsum("...cp,cpq->...cq", part, kernel.conj()), start + kernel.shape[1]
         return total.unflatten(-1, self.grid.shape).to(field.dtype)
 
     def _kernels(self, device: torch.device) -> Iterator[Tensor]:
