@@ -51,10 +51,10 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     scene = load_config(path, list(settings.scene.change))
     if not isinstance(scene, VolumeSettings):
         raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {scene.experiment!r}"])
-    own = {
+    overrides = {
         name: value for name in ("volume", "transfer", "wavelengths") if (value := getattr(settings, name)) is not None
     }
-    scene = scene.model_copy(update=own)
+    scene = scene.model_copy(update=overrides)
     if problems := contradictions(scene):
         raise ConfigError([f"{'.'.join(map(str, key))}: {problem}" for key, problem in problems])
     return scene

@@ -88,7 +88,7 @@ def _scores(
     shown: dict[str, Tensor],
 ) -> list[dict[str, Any]]:
     """Table rows of every contender on one target [1, 1, H, W]."""
-    own = PECProblem(problem.crosstalk, problem.propagator, target, scale_free=True, amplitude=True)
+    scored = PECProblem(problem.crosstalk, problem.propagator, target, scale_free=True, amplitude=True)
     cool = 3 + 0.3 * torch.rand(target.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         warm, ahead = _timed(lambda: model(target))
@@ -97,7 +97,7 @@ def _scores(
     for steps in budgets:
         solver = LBFGS(max_steps=steps)
         for name, start, before in (("L-BFGS", cool, 0.0), ("L-BFGS from the network", warm, ahead)):
-            phase, seconds = _timed(lambda s=solver, x=start: s(own, x, Box(0.0, LIMIT)).x)
+            phase, seconds = _timed(lambda s=solver, x=start: s(scored, x, Box(0.0, LIMIT)).x)
             rows.append(_row(picture, name, steps, quality(problem, phase, target), before + seconds))
             if steps == 10:
                 shown[f"10 steps of {name}"] = problem.intensity(phase)

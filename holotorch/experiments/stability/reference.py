@@ -56,12 +56,12 @@ def _cycles(
 ) -> float:
     """Cycles by which the integrand turns over the band of one axis, at most, for light of up to ``sine``."""
     farthest = 0.0
-    for own in (tilt[axis] - sine, tilt[axis] + sine):
+    for offset in (tilt[axis] - sine, tilt[axis] + sine):
         for other in (tilt[1 - axis] - sine, tilt[1 - axis] + sine):
-            cosine = math.sqrt(max(1 - own**2 - other**2, _STEEPEST**2))
+            cosine = math.sqrt(max(1 - offset**2 - other**2, _STEEPEST**2))
             for start in (positions[0], positions[-1]):
                 for end in (reached[0], reached[-1]):
-                    farthest = max(farthest, abs(start + distance * own / cosine - end))
+                    farthest = max(farthest, abs(start + distance * offset / cosine - end))
     return farthest / pitch
 
 

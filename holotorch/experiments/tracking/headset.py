@@ -94,11 +94,11 @@ def alignment_text(alignment: Alignment, headset: Tensor) -> str:
         f"Alignments {len(left_out)}, residuals {1e3 * float(alignment.residuals.square().mean().sqrt()):.2f} mm (rms)",
         f"Tip        expected within {1e3 * expected:.2f} mm (standard deviation, in the middle of the alignments)",
     ]
-    for number, (own, other) in enumerate(zip(alignment.residuals.tolist(), left_out.tolist(), strict=True), 1):
+    for number, (residual, other) in enumerate(zip(alignment.residuals.tolist(), left_out.tolist(), strict=True), 1):
         without = (
             f"{1e3 * other:.2f} mm from the others" if math.isfinite(other) else "the others alone determine nothing"
         )
-        lines.append(f"Alignment  {number}: {1e3 * own:.2f} mm; {without}")
+        lines.append(f"Alignment  {number}: {1e3 * residual:.2f} mm; {without}")
     finite = left_out[left_out.isfinite()]
     if len(finite) > 3 and float(finite.max()) > _SLIPPED * float(finite.median()):
         worst = int(torch.where(left_out.isfinite(), left_out, 0.0).argmax()) + 1

@@ -121,8 +121,8 @@ def neighbour_error(wavelengths: Tensor, weights: Tensor, count: int, light: Pup
     offsets = wavelengths - wavelengths[nodes][nearest]
     walk = 0.0
     for node in range(len(nodes)):
-        own = torch.tensor(nearest) == node
-        for side in (own & (offsets >= 0), own & (offsets <= 0)):
+        derived = torch.tensor(nearest) == node
+        for side in (derived & (offsets >= 0), derived & (offsets <= 0)):
             distances, order = offsets[side].abs().sort()
             beyond = share[side][order].flip(0).cumsum(0).flip(0)
             walk += (beyond[1:].square() * distances.diff()).sum().item()
