@@ -1,6 +1,5 @@
 """Runs of a measurement: tracks or reads its sources, guides the hand at a live camera, and writes the results."""
 
-import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked
-from holotorch.io.files import write_bytes
+from holotorch.io.files import without_nan, write_bytes
 from holotorch.tracking import Pose
 
 _LOOKS = 10  # frames at the beginning in which the chessboard of the sheet is searched, which takes up to a second each
@@ -131,7 +130,7 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     files.write(write_bytes, folder.path / "images" / "measure.png", result.figure[0])
     for name, save in result.saved.items():
         files.write(save, folder.path / name)
-    complete = conclude(folder, _finite(summary), files, done=True)
+    complete = conclude(folder, without_nan(summary), files, done=True)
     print(verdict(summary), *(note for note in result.notes if note not in announced), sep="\n", flush=True)
     return complete
 
@@ -190,12 +189,3 @@ def restart_measurement(folder: Path, config: dict[str, Any]) -> str | None:
     if not any(isinstance(name, str | int) and str(name) != SYNTHETIC and is_camera(str(name)) for name in names):
         return None
     return f"the frames of a camera are gone; poses that it has found are in {folder / 'poses.csv'}: measure those"
-
-
-def _finite(value: Any) -> Any:
-    """JSON values without NaN and infinity, which become None."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

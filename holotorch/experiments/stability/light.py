@@ -70,13 +70,6 @@ def _light(fwhm: float) -> tuple[Tensor, Tensor]:
     return Spectrum.lorentzian(CENTRE, fwhm).samples(EVERY)
 
 
-def _inside() -> Tensor:
-    """Noise [1, H, W] within the middle half of the window, whose light stays in it for all wavelengths."""
-    y, x = GRID.coordinates()
-    inside = (y.abs() < GRID.extent[0] / 4) & (x.abs() < GRID.extent[1] / 4)
-    return (reference.noise(GRID.shape) * inside)[None]
-
-
 def _propagated(tolerance: float, fwhm: float) -> Answer:
     """The image [1, H, W] with as many wavelengths propagated as the tolerance requires.
 
@@ -87,7 +80,7 @@ def _propagated(tolerance: float, fwhm: float) -> Answer:
     light = pupil_illumination(GRID, wavelengths.mean().item(), *OPTICS)
     predicted = neighbour_error(wavelengths, weights, count, light)
     retina = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE)
-    return Answer(retina(_inside()), predicted, f"{count} of {EVERY} wavelengths", tolerance)
+    return Answer(retina(reference.noise_inside(GRID)), predicted, f"{count} of {EVERY} wavelengths", tolerance)
 
 
 def _each(tolerance: float, fwhm: float) -> Tensor:
@@ -96,7 +89,10 @@ def _each(tolerance: float, fwhm: float) -> Tensor:
     count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
     wide = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE).wide[0]
     y, x = ((big - small) // 2 for big, small in zip(wide.shape, GRID.shape, strict=True))
-    field, total = functional.pad(_inside(), (x, x, y, y)), torch.zeros(1, *wide.shape, dtype=torch.float64)
+    field, total = (
+        functional.pad(reference.noise_inside(GRID), (x, x, y, y)),
+        torch.zeros(1, *wide.shape, dtype=torch.float64),
+    )
     for wavelength, weight in zip(wavelengths.tolist(), weights.tolist(), strict=True):
         total += weight * Retina(wide, wavelength, *OPTICS, tolerance=LOOSE)(field)
     return total[..., y : y + GRID.shape[0], x : x + GRID.shape[1]]

@@ -80,3 +80,10 @@ def _nodes(cycles: float) -> tuple[np.ndarray, np.ndarray]:
 def noise(shape: tuple[int, ...], seed: int = 0, dtype: torch.dtype = torch.complex128) -> Tensor:
     """Independent normal numbers of a seed, the content that most methods predict errors for."""
     return torch.randn(*shape, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def noise_inside(grid: Grid) -> Tensor:
+    """Noise within the middle half of the window, complex128 [1, H, W], so that little light leaves it."""
+    y, x = grid.coordinates()
+    inside = (y.abs() < grid.extent[0] / 4) & (x.abs() < grid.extent[1] / 4)
+    return (noise(grid.shape) * inside)[None]

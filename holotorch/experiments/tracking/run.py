@@ -2,7 +2,6 @@
 
 import csv
 import io
-import math
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,7 +27,7 @@ from holotorch.experiments.tracking.forecast import range_text
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
 from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
 from holotorch.experiments.tracking.synthetic import compared, errors, read_truth, synthetic_rig, write_synthetic
-from holotorch.io.files import append, replacing, write_bytes
+from holotorch.io.files import append, replacing, without_nan, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
 from holotorch.tracking import Pose, Status
@@ -214,7 +213,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         if failure is not None:
             results.failure = None  # only the first failure is reported
         done = failure is None and (not run.signals or frames.live)
-        complete = conclude(run, _without_nan(summary), results, done=done)
+        complete = conclude(run, without_nan(summary), results, done=done)
     if failure is not None:
         raise failure
     return complete
@@ -286,12 +285,3 @@ def _holds_frames(folder: Path) -> bool:
     """Whether the folder contains a pose, a refusal, or a recorded frame."""
     tables = (folder / "poses.csv", folder / "recording" / "times.csv")
     return any(path.is_file() and path.read_bytes().count(b"\n") > 1 for path in tables)
-
-
-def _without_nan(value: Any) -> Any:
-    """Replace NaN and infinity by None, since JSON cannot represent them and the summary could not be written."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
