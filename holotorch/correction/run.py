@@ -254,6 +254,7 @@ class Solver:
         """
         run = Run(self, objective, start, project, resume)
         extra = {name: run.resumed.get(name, value) for name, value in self._begin(run).items()}
+        del run.gradient  # a step that needs it holds it in ``extra``
         while run.step < self.max_steps and (run.active.any() if run.any_active is None else run.any_active):
             extra = self._advance(run, **extra)
             if callback:

@@ -15,6 +15,7 @@ CHARTS = {
     "stability": ("holotorch.experiments.stability.chart", ""),
     "volume": ("holotorch.experiments.volume.chart", "scaling"),
     "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
+    "retina": ("holotorch.experiments.eye.retina_chart", ""),
     "scaling": ("holotorch.experiments.scaling.chart", ""),
     "camera": ("holotorch.experiments.camera.chart", "corrected"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
