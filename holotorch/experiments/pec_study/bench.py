@@ -144,9 +144,9 @@ class Bench:
         solution = run_stages(penalty_schedule(make, solver, self.crosstalk.total, limit), start, callback=callback)
         return solution if limit is None else replace(solution, x=limit_peak_phase(limit, solution.x, self.crosstalk))
 
-    def algorithm2(self, start: Tensor, *, steps: int = 400) -> Solution:
+    def algorithm2(self, start: Tensor, *, steps: int = 400, callback: Callback | None = None) -> Solution:
         """Thesis Algorithm 2, proximal proximity effect correction (PPEC)."""
-        return APG(max_steps=steps)(self.experiment.problem(), start)
+        return APG(max_steps=steps)(self.experiment.problem(), start, callback=callback)
 
     def retrieved(self, kind: str, seed: int = 7) -> Solution:
         """Gerchberg-Saxton; ``kind`` is "none", "basic" (crosstalk in the loop) or "ipec" (deconvolution as well)."""
