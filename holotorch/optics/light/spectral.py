@@ -144,10 +144,8 @@ def spectral_image(
     lengths = torch.tensor(given, dtype=torch.float64)
     shares = torch.as_tensor(weights, dtype=torch.float64)
     if shares.ndim not in (1, 2) or len(lengths) != shares.shape[-1] or bool((lengths.diff() <= 0).any()):
-        raise ValueError(
-            f"wavelengths must increase, with one weight each, got {len(lengths)} wavelengths, "
-            f"weights {tuple(shares.shape)}"
-        )
+        got = f"{len(lengths)} wavelengths, weights {tuple(shares.shape)}"
+        raise ValueError(f"wavelengths must increase, with one weight each, got {got}")
     if not bool((shares >= 0).all()) or not 0 < shares.sum() < math.inf:
         raise ValueError(f"weights must be at least 0, finite and not all 0, got {shares.tolist()}")
     power = shares.detach().reshape(-1, len(lengths)).sum(0)
