@@ -1,4 +1,4 @@
-"""Heater phases that give a wanted phase after thermal spreading (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
+"""Heater phases that give a target phase after thermal spreading (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
 
 import math
 from typing import Protocol

@@ -1,4 +1,4 @@
-"""PECProblem: the squared difference between the image of a thermally coupled array and the wanted image."""
+"""PECProblem: the squared difference between the image of a thermally coupled array and the target image."""
 
 import math
 from collections.abc import Callable

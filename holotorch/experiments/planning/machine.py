@@ -69,7 +69,7 @@ class Machine:
         return self.interpreter * (_START + _FIGURE * figures)
 
     def score(self, values: int, *, double: bool) -> float:
-        """Seconds to compare pictures of ``values`` in total with those wanted, by SSIM and PSNR."""
+        """Seconds to compare pictures of ``values`` in total with their targets, by SSIM and PSNR."""
         return (2 if double else 1) * values * _SCORE[values > _CACHED] * self.elementwise
 
     def __str__(self) -> str:
