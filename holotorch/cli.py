@@ -110,7 +110,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _new(options: argparse.Namespace) -> int:
-    from holotorch.experiments.beginnings import write_example
+    from holotorch.experiments.templates import write_example
 
     out = options.out or Path(f"{options.kind}.yaml")
     write_example(options.kind, out)
@@ -119,14 +119,14 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _keys(options: argparse.Namespace) -> int:
-    from holotorch.experiments.beginnings import keys_text
+    from holotorch.experiments.templates import keys_text
 
     print(keys_text(options.kind, options.prefix))
     return OK
 
 
 def _schema(options: argparse.Namespace) -> int:
-    from holotorch.experiments.beginnings import schema
+    from holotorch.experiments.templates import schema
 
     print(schema(options.kind))
     return OK

@@ -82,7 +82,7 @@ def readable(*tensors: Tensor) -> bool:
 
     They must have values, see :func:`have_values`, on the CPU: reading from a GPU waits for all that it has to do.
     """
-    return have_values(*tensors) and all(each.device.type == "cpu" for each in tensors)
+    return have_values(*tensors) and all(tensor.device.type == "cpu" for tensor in tensors)
 
 
 def have_values(*tensors: Tensor) -> bool:
@@ -93,7 +93,7 @@ def have_values(*tensors: Tensor) -> bool:
     """
     if torch.compiler.is_compiling():
         return False
-    return all(type(each) in (Tensor, nn.Parameter) and not each.is_meta for each in tensors)
+    return all(type(tensor) in (Tensor, nn.Parameter) and not tensor.is_meta for tensor in tensors)
 
 
 def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
@@ -139,18 +139,18 @@ def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:
             raise ValueError(f"{name or kind.name} {problem}")
 
 
-def whole(name: str, value: int, least: int) -> int:
-    """Return ``value`` as int, or raise TypeError unless it is an integer and ValueError if it is below ``least``."""
+def whole(name: str, value: int, minimum: int) -> int:
+    """Return ``value`` as int, or raise TypeError unless it is an integer and ValueError if it is below ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name} must be a whole number, got {type(value).__name__} {value!r}")
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value!r}")
+    if value < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {value!r}")
     return int(value)
 
 
-def port(value: int, least: int = 0) -> int:
-    """Return the number of a TCP or UDP port as int, or raise unless it lies in ``least`` .. 65535."""
-    if whole("port", value, least) > 65535:
+def port(value: int, minimum: int = 0) -> int:
+    """Return the number of a TCP or UDP port as int, or raise unless it lies in ``minimum`` .. 65535."""
+    if whole("port", value, minimum) > 65535:
         raise ValueError(f"port must be at most 65535, got {value!r}")
     return int(value)
 

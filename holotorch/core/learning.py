@@ -24,7 +24,7 @@ class PreciseModule(nn.Module):
     def keep(self, name: str, values: Tensor | None) -> None:
         """Keep a tensor that follows from the arguments as an attribute that moves with the module."""
         without_graph(name, values)
-        self._kept = (*(each for each in self._kept if each != name), name)
+        self._kept = (*(kept for kept in self._kept if kept != name), name)
         setattr(self, name, values)
 
     def hold(self, name: str, value: Tensor | float | tuple[float, ...], *, learnable: bool = False) -> bool:

@@ -1,4 +1,4 @@
-"""Proximity effect correction: heater phases that form the wanted image although heat spreads between pixels."""
+"""Proximity effect correction: heater phases that form the target image although heat spreads between pixels."""
 
 from holotorch.core.deprecation import renamed
 from holotorch.correction.calibration import Calibration, calibrate, scan

@@ -135,12 +135,12 @@ def _residual(model: nn.Module, patterns: Tensor, images: Tensor, values: Values
     if predicted.shape != images.shape:
         raise ValueError(f"images must have the shape of model(patterns), {tuple(predicted.shape)}, got "
                          f"{tuple(images.shape)}")  # fmt: skip
-    predicted, wanted = predicted.double().flatten(), images.double().flatten()
+    predicted, measured = predicted.double().flatten(), images.double().flatten()
     power = predicted.square().sum().item()
     if not (math.isfinite(power) and power > 0):
         raise ValueError("the model must predict light that is finite and not 0 everywhere")
-    gain = (predicted @ wanted).item() / power
-    return gain * predicted - wanted, predicted, gain
+    gain = (predicted @ measured).item() / power
+    return gain * predicted - measured, predicted, gain
 
 
 def _linearised(

@@ -1,4 +1,4 @@
-"""Heater phases that give a wanted phase after thermal spreading (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
+"""Heater phases that give a target phase after thermal spreading (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
 
 import math
 from typing import Protocol
@@ -77,12 +77,12 @@ def deconvolve_admm(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30,
     (down, basis_y), (across, basis_x) = (torch.linalg.eigh(matrix) for matrix in _axis_matrices(crosstalk, phase))
     eigenvalues = down[:, None] * across
     penalty = weight * eigenvalues.square().mean()
-    wanted = basis_y.T @ phase.to(torch.float64) @ basis_x * eigenvalues
+    target = basis_y.T @ phase.to(torch.float64) @ basis_x * eigenvalues
     z = phase.to(torch.float64).clamp(min=0)
     dual = torch.zeros_like(z)
     for _ in range(max_steps):
         coefficients = basis_y.T @ (z - dual) @ basis_x
-        x = basis_y @ ((wanted + penalty * coefficients) / (eigenvalues.square() + penalty)) @ basis_x.T
+        x = basis_y @ ((target + penalty * coefficients) / (eigenvalues.square() + penalty)) @ basis_x.T
         z = (x + dual).clamp(min=0)
         dual = dual + x - z
     return z.to(phase.dtype)

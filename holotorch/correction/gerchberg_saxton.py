@@ -69,8 +69,8 @@ def gerchberg_saxton(
 
     with torch.no_grad():
         for step in range(max_steps + 1):
-            wanted = wrapped(torch.angle(propagator.adjoint(image)))
-            phase = wanted if deconvolution is None else deconvolution(wanted, phase if step else None)
+            phase_of_image = wrapped(torch.angle(propagator.adjoint(image)))
+            phase = phase_of_image if deconvolution is None else deconvolution(phase_of_image, phase if step else None)
             spread = phase if crosstalk is None else crosstalk(phase)
             formed = propagator(phasor(spread))
             magnitude = intensity(formed).sqrt()

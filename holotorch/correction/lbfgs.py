@@ -60,12 +60,12 @@ class LBFGS(Solver):
         direction = free * run.from_rows(rows)
         # A memory may no longer describe the loss, for example because other elements are held.
         ascending = ~(run.total(direction * gradient) < 0)
-        direction = torch.where(run.each(ascending), -free * guess, direction)
+        direction = torch.where(run.expanded(ascending), -free * guess, direction)
         empty = ascending | memory.empty.reshape(run.loss.shape)
         largest = run.rows(direction.abs()).amax(-1)
         first_length = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
         length = torch.where(empty, first_length, 1.0)
-        x, loss, after, failed, turned, going = self._search(run, direction, gradient, length, ascending)
+        x, loss, after, failed, turned, any_active = self._search(run, direction, gradient, length, ascending)
         # A step that fails with a memory may succeed without it; an item whose step fails without a memory has stalled.
         stalled = failed & empty
         if turned:
@@ -73,8 +73,8 @@ class LBFGS(Solver):
         change = after - gradient
         pair = x - run.x, change, self._preconditioned(change)
         memory.add(*(run.rows(part).reshape(flat) for part in pair))
-        run.advance(x, loss, stalled, going=going)
-        gradient = torch.where(run.each(run.active), after, gradient)
+        run.advance(x, loss, stalled, any_active=any_active)
+        gradient = torch.where(run.expanded(run.active), after, gradient)
         return {"gradient": gradient, **memory.state()}
 
     def _preconditioned(self, x: Tensor) -> Tensor:
@@ -102,22 +102,22 @@ class LBFGS(Solver):
         best, best_loss, best_gradient = run.x, run.loss, gradient
         first = True
         while True:
-            x = run.project(run.x + run.each(length) * direction)
+            x = run.project(run.x + run.expanded(length) * direction)
             loss, after = run.value_and_gradient(x)
             decrease = _ARMIJO * run.total(gradient * (x - run.x))
             enough = ~accepted & (loss <= run.loss + decrease + slack)
             accepted = accepted | enough
             failed = ~accepted & (length <= shortest)
-            left, others, turned, going = run.read(
+            left, others, turned, any_active = run.read(
                 ~(accepted | failed), ~enough, ascending | failed, run.remaining(loss, failed)
             )
             if not others:  # usually in the first trial
-                return x, loss, after, failed, turned, going
-            moved = run.each(enough)
+                return x, loss, after, failed, turned, any_active
+            moved = run.expanded(enough)
             best, best_gradient = torch.where(moved, x, best), torch.where(moved, after, best_gradient)
             best_loss = torch.where(enough, loss, best_loss)
             if not left:
-                return best, best_loss, best_gradient, failed, turned, going if first else None
+                return best, best_loss, best_gradient, failed, turned, any_active if first else None
             length, first = torch.where(accepted, length, length * _SHRINK), False
 
 

@@ -1,4 +1,4 @@
-"""PECProblem: the squared difference between the image of a thermally coupled array and the wanted image."""
+"""PECProblem: the squared difference between the image of a thermally coupled array and the target image."""
 
 import math
 from collections.abc import Callable
@@ -131,10 +131,10 @@ class PECProblem(nn.Module):
             steps = self._total(phase.diff(dim=-1).square()) + self._total(phase.diff(dim=-2).square())
             loss = loss + self.smoothness_weight * steps
         if self.light_weight:
-            wanted = self.target if target is None else target
+            reference = self.target if target is None else target
             images = math.prod(image.shape[-self.image_axes : -2])
             arrives = image.flatten(-self.image_axes).sum(-1) / (images * math.prod(phase.shape[-2:]))
-            loss = loss + self.light_weight * wanted.flatten(-self.image_axes).sum(-1) * (1 - arrives)
+            loss = loss + self.light_weight * reference.flatten(-self.image_axes).sum(-1) * (1 - arrives)
         return loss
 
     def intensity(self, phase: Tensor) -> Tensor:
@@ -149,8 +149,8 @@ class PECProblem(nn.Module):
         self._check_axes(target)
         axes = 1 + self.image_axes
         if formed.shape[-axes:] != target.shape[-axes:]:
-            wanted = "end in (C, H, W)" if axes == 3 else "give an image that ends in (C, *image)"
-            raise ValueError(f"phase must {wanted} = {tuple(target.shape[-axes:])}, got {tuple(formed.shape)}")
+            expected = "end in (C, H, W)" if axes == 3 else "give an image that ends in (C, *image)"
+            raise ValueError(f"phase must {expected} = {tuple(target.shape[-axes:])}, got {tuple(formed.shape)}")
         try:
             torch.broadcast_shapes(formed.shape, target.shape)
         except RuntimeError:

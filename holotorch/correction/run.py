@@ -108,7 +108,7 @@ class Run:
         self.steps = torch.zeros_like(loss, dtype=torch.int64)
         self.calm = torch.zeros_like(self.steps)  # steps in a row whose change of loss was within the tolerance
         self.stalled = torch.zeros_like(self.active)
-        self.going: bool | None = None  # whether any item is active, if a step has read this from the device
+        self.any_active: bool | None = None  # whether any item is active, if a step has read this from the device
         self.resumed: State = {}
         if resume:
             self._restore(resume)
@@ -131,7 +131,7 @@ class Run:
         """Sum of values shaped as x over the elements of each item, [...]."""
         return self.rows(values).sum(-1)
 
-    def each(self, values: Tensor) -> Tensor:
+    def expanded(self, values: Tensor) -> Tensor:
         """Reshape one value per item, [...], so that it broadcasts against x."""
         return values.reshape(self.broadcast)
 
@@ -163,12 +163,13 @@ class Run:
         settled = (loss - self.loss).abs() < self.solver.tolerance * self.loss  # thesis Eq. 4.36
         return torch.where(settled, self.calm + 1, 0)
 
-    def advance(self, x: Tensor, loss: Tensor, stalled: Tensor, *, going: bool | None = None) -> None:
-        """Move the active items to ``x``, and stop those that have converged or stalled; ``going`` as the attribute."""
-        last, self.going = self.loss, going
+    def advance(self, x: Tensor, loss: Tensor, stalled: Tensor, *, any_active: bool | None = None) -> None:
+        """Move the active items to ``x``, and stop those that have converged or stalled."""
+        last, self.any_active = self.loss, any_active
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
-        self.x = torch.where(self.each(self.active), x, self.x)  # unconditional, since a test would wait for the GPU
+        # Unconditional, since a test would wait for the GPU.
+        self.x = torch.where(self.expanded(self.active), x, self.x)
         loss = torch.where(self.active, loss, last)
         self.calm = self._calm(loss)
         self.step += 1
@@ -254,7 +255,7 @@ class Solver:
         run = Run(self, objective, start, project, resume)
         extra = {name: run.resumed.get(name, value) for name, value in self._begin(run).items()}
         del run.gradient  # a step that needs it holds it in ``extra``
-        while run.step < self.max_steps and (run.active.any() if run.going is None else run.going):
+        while run.step < self.max_steps and (run.active.any() if run.any_active is None else run.any_active):
             extra = self._advance(run, **extra)
             if callback:
                 callback(run.solution(**extra))

@@ -47,13 +47,13 @@ class APG(Solver):
         return {"previous": run.x, "step_length": step, "count": torch.zeros_like(step)}
 
     def _advance(self, run: Run, *, previous: Tensor, step_length: Tensor, count: Tensor) -> State:
-        y = run.x + run.each(count / (count + 3)) * (run.x - previous)
-        x, loss, step_length, stalled, going = self._descend(run, y, step_length)
+        y = run.x + run.expanded(count / (count + 3)) * (run.x - previous)
+        x, loss, step_length, stalled, any_active = self._descend(run, y, step_length)
         count = count + 1
         if self.restart:
             count = torch.where(loss > run.loss, 0, count)
         previous = run.x
-        run.advance(x, loss, stalled, going=going)
+        run.advance(x, loss, stalled, any_active=any_active)
         return {"previous": previous, "step_length": step_length * self.grow, "count": count}
 
     def _descend(self, run: Run, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, bool]:
@@ -66,7 +66,7 @@ class APG(Solver):
         least = self.step * torch.finfo(y.dtype).eps ** 2
         shortened = torch.zeros_like(run.active)
         while True:
-            z = run.project(y - run.each(step) * gradient)
+            z = run.project(y - run.expanded(step) * gradient)
             moved = z - y
             loss = run.value(z)
             bound = value + run.total(gradient * moved) + run.total(moved.square()) / (2 * step)
@@ -75,9 +75,9 @@ class APG(Solver):
             # An item whose step was shortened until z = y has stalled as well. An item that does not move in the
             # first trial is at a minimum on the boundary of the set.
             unmoved = stalled | (shortened & (run.total(moved != 0) == 0))
-            shorten, going = run.read(refused & ~stalled, run.remaining(loss, unmoved))
+            shorten, any_active = run.read(refused & ~stalled, run.remaining(loss, unmoved))
             if not shorten:
-                return z, loss, step, unmoved, going
+                return z, loss, step, unmoved, any_active
             step = torch.where(refused, step * self.shrink, step)
             shortened = shortened | refused
 
@@ -117,7 +117,7 @@ class ProjectedAdam(Solver):
         step = run.step + 1
         scale = torch.sqrt(square / (1 - self.betas[1] ** step)) + 1e-8
         x = run.project(run.x - self.learning_rate / (1 - self.betas[0] ** step) * mean / scale)
-        x = torch.where(run.each(run.active), x, run.x)
+        x = torch.where(run.expanded(run.active), x, run.x)
         loss, gradient = run.value_and_gradient(x)
         run.advance(x, loss, ~torch.isfinite(loss))
         return {"gradient": gradient, "mean": mean, "square": square}

@@ -78,8 +78,8 @@ def penalty_schedule(
         first = total // 3
         parts = [({"amplitude": amplitude}, Box(0.0, limit / spread), first)]
         ends = [first + round((total - first) * fraction) for fraction in (0.0, 0.3, 0.6, 0.85, 1.0)]
-        for weight, (begin, end) in zip((1.0, 10.0, 100.0, 1000.0), pairwise(ends), strict=True):
-            parts.append(({"limit": 0.985 * limit, "limit_weight": weight}, nonnegative, end - begin))
+        for weight, (start, end) in zip((1.0, 10.0, 100.0, 1000.0), pairwise(ends), strict=True):
+            parts.append(({"limit": 0.985 * limit, "limit_weight": weight}, nonnegative, end - start))
     return [
         Stage(make(**keywords), replace(solver, max_steps=steps), box) for keywords, box, steps in parts if steps > 0
     ]

@@ -52,23 +52,23 @@ def interrupted(outcomes: dict[str, Outcome]) -> bool:
 
 
 def _outcome(subject: str, folder: Path, quick: bool) -> Outcome:
-    begin = time.perf_counter()
+    start = time.perf_counter()
     try:
-        return Outcome(verdict=chart(subject, folder, quick=quick), problem="", seconds=time.perf_counter() - begin)
+        return Outcome(verdict=chart(subject, folder, quick=quick), problem="", seconds=time.perf_counter() - start)
     except KeyboardInterrupt:
         problem = _INTERRUPTED
     except ConfigError as error:
         problem = str(error)
     except Exception as error:  # an error in one subject does not stop the others
         problem = f"{type(error).__name__}: {error}"
-    return Outcome(time.perf_counter() - begin, problem=problem)
+    return Outcome(time.perf_counter() - start, problem=problem)
 
 
 def _page(outcomes: dict[str, Outcome], out: Path, quick: bool) -> str:
     drawn = sum(not outcome.problem for outcome in outcomes.values())
     title = "Speed against accuracy" + (", quick form" if quick else "")
     status = "complete" if drawn == len(outcomes) else f"{drawn} of {len(outcomes)} drawn"
-    rows = [[name, f"{each.seconds:.1f}" if each.seconds else "", each.problem] for name, each in outcomes.items()]
+    rows = [[name, f"{run.seconds:.1f}" if run.seconds else "", run.problem] for name, run in outcomes.items()]
     rows.append(["all", f"{sum(outcome.seconds for outcome in outcomes.values()):.1f}", ""])
     parts = [page.heading(title, status), page.table(("subject", "seconds", "problem"), rows)]
     for subject, outcome in outcomes.items():

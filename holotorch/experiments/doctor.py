@@ -36,14 +36,14 @@ def _python() -> Iterator[tuple[bool, str]]:
 
 def _packages() -> Iterator[tuple[bool, str]]:
     for line in metadata.requires("holotorch") or []:
-        wanted = Requirement(line)
-        if wanted.marker and "extra" in str(wanted.marker):
+        requirement = Requirement(line)
+        if requirement.marker and "extra" in str(requirement.marker):
             continue
-        version = installed_version(wanted.name)
-        if version and wanted.specifier.contains(version, prereleases=True):
-            yield True, f"{wanted.name} {version}"
+        version = installed_version(requirement.name)
+        if version and requirement.specifier.contains(version, prereleases=True):
+            yield True, f"{requirement.name} {version}"
         else:
-            yield False, f"{wanted} needed, {version or 'nothing'} found; run: pip install '{wanted}'"
+            yield False, f"{requirement} needed, {version or 'nothing'} found; run: pip install '{requirement}'"
 
 
 def _devices() -> Iterator[tuple[bool, str]]:
@@ -60,14 +60,14 @@ def _devices() -> Iterator[tuple[bool, str]]:
 
 
 def _opencv() -> Iterator[tuple[bool, str]]:
-    wanted = "opencv-contrib-python-headless"
+    package = "opencv-contrib-python-headless"
     names = {dist.metadata["Name"].lower() for dist in metadata.distributions()}
-    others = sorted(name for name in names if name.startswith("opencv") and name != wanted)
+    others = sorted(name for name in names if name.startswith("opencv") and name != package)
     if others:
-        repair = f"pip uninstall -y {' '.join(others)} && pip install --force-reinstall --no-deps {wanted}"
-        yield False, f"{', '.join(others)} beside {wanted} overwrite each other; run: {repair}"
+        repair = f"pip uninstall -y {' '.join(others)} && pip install --force-reinstall --no-deps {package}"
+        yield False, f"{', '.join(others)} beside {package} overwrite each other; run: {repair}"
     else:
-        yield True, f"{wanted} alone"
+        yield True, f"{package} alone"
 
 
 def _fft() -> Iterator[tuple[bool, str]]:
@@ -107,10 +107,10 @@ def _udp() -> Iterator[tuple[bool, str]]:
 def _extras() -> Iterator[tuple[bool, str]]:
     missing: dict[str, list[str]] = {}
     for line in metadata.requires("holotorch") or []:
-        wanted = Requirement(line)
-        match = re.search(r"""extra == ['"](\w+)['"]""", str(wanted.marker))
-        if match and installed_version(wanted.name) is None:
-            missing.setdefault(match[1], []).append(wanted.name)
+        requirement = Requirement(line)
+        match = re.search(r"""extra == ['"](\w+)['"]""", str(requirement.marker))
+        if match and installed_version(requirement.name) is None:
+            missing.setdefault(match[1], []).append(requirement.name)
     for extra, names in missing.items():
         yield True, f"{', '.join(names)} not installed (optional); to add: pip install 'holotorch[{extra}]'"
     if not missing:

@@ -29,8 +29,8 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
     plan = kind.plan(experiment)
     with joined_processes(kind.parallel) as rank:
         if rank > 0:  # only the first process writes to the folder
-            with interruptible() as pressed:
-                return Path(), kind.run(experiment, RunFolder(Path(), name, plan, pressed))
+            with interruptible() as signals:
+                return Path(), kind.run(experiment, RunFolder(Path(), name, plan, signals))
         if kind.announces:
             print(plan.text, flush=True)
         if plan.shortage:

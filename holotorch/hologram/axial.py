@@ -18,7 +18,7 @@ from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.nodes import Nodes, axial_range, choose_nodes
 from holotorch.hologram.padding import Axis, choose_length, faded_out
 from holotorch.hologram.raster import Raster, has_light
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 from holotorch.optics.free_space.padding import FINEST
 
 _GROUP = 16  # largest number of planes that one matrix product spreads onto the nodes
@@ -48,7 +48,7 @@ class AxialDesign:
         """
         _, offset = self._axial_frequency(like.device)
         whole = torch.ones(self.size, dtype=like.dtype, device=like.device)
-        return multiply_even(whole, turns_phasor(offset * (self.nodes.spacing * nodes)).to(like.dtype))
+        return multiply_even(whole, cycles_phasor(offset * (self.nodes.spacing * nodes)).to(like.dtype))
 
     def last(self, node: int, like: Tensor) -> Tensor:
         """First quadrant of the factor by which the sum over all nodes is multiplied, to give the hologram's spectrum.
@@ -64,7 +64,7 @@ class AxialDesign:
                 strength = strength * taper(2 * axis.pitch * frequency)
             strength = strength * faded_out(frequency / axial, *axis.fade(length))
         # The factor i of Weyl's expansion is a phase of a quarter cycle.
-        wave = turns_phasor(offset * self.nodes.depth(node) + 0.25)
+        wave = cycles_phasor(offset * self.nodes.depth(node) + 0.25)
         return (wave * strength).to(like.dtype)
 
     def _axial_frequency(self, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -193,7 +193,7 @@ class AxialHologram(LayerHologram):
         for item, layers in zip(field, out, strict=True):
             spectrum = multiply_even(raster.spectrum_of_pixels(item), design.last(0, field).conj())
             for m in range(nodes.count):
-                planes = [j for j, begin in enumerate(begins) if begin <= m < begin + nodes.width]
+                planes = [j for j, start in enumerate(begins) if start <= m < start + nodes.width]
                 layer = raster.layer(spectrum) if planes else spectrum
                 for j in planes:
                     layers[j] += layer * weights[j][m - begins[j]].conjugate()
@@ -287,9 +287,9 @@ class Accumulator:
         self._close(self.open - touched)
         self.open |= touched
         matrix = [[0j] * len(order) for _ in range(self.rows)]
-        for column, (j, begin) in enumerate(zip(order, begins, strict=True)):
+        for column, (j, start) in enumerate(zip(order, begins, strict=True)):
             for k, weight in enumerate(self.weights[j]):
-                matrix[(begin + k) % self.rows][column] = weight
+                matrix[(start + k) % self.rows][column] = weight
         spread = torch.tensor(matrix, dtype=torch.complex128)
         height, _, width = planes.shape
         if self.block is None:
@@ -338,9 +338,9 @@ def _stacked(planes: list[Tensor]) -> Tensor:
     first = planes[0]
     if not checks.readable(*planes):  # nor have they addresses
         return torch.stack(planes, 1)
-    begin, memory = first.data_ptr(), first.untyped_storage().data_ptr()
+    start, memory = first.data_ptr(), first.untyped_storage().data_ptr()
     for k, plane in enumerate(planes):
-        adjacent = plane.untyped_storage().data_ptr() == memory and plane.data_ptr() == begin + k * first.nbytes
+        adjacent = plane.untyped_storage().data_ptr() == memory and plane.data_ptr() == start + k * first.nbytes
         if not (adjacent and plane.is_contiguous()):
             return torch.stack(planes, 1)
     return first.as_strided((len(first), len(planes), first.shape[1]), (first.shape[1], first.numel(), 1))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.hologram.cone import TAPER_BEGIN, taper
-from holotorch.optics.free_space.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.kernels import carrier, cycles_phasor
 
 _RULE = np.polynomial.legendre.leggauss(64)  # nodes and weights of one panel
 _CYCLES = 10.0  # cycles of the integrand allowed per panel; up to about 15 the rule is exact to rounding
@@ -30,7 +30,7 @@ def point_spectrum(fy: Tensor, fx: Tensor, wavelength: float, depth: float) -> T
     square = fy.square() + fx.square()
     axial = torch.sqrt(wavelength**-2 - square)
     cycles = 0.25 - depth * square / (axial + 1 / wavelength)
-    return turns_phasor(cycles) * (carrier(wavelength, depth).to(square.device) / axial)
+    return cycles_phasor(cycles) * (carrier(wavelength, depth).to(square.device) / axial)
 
 
 def band_limited_wave(
@@ -59,8 +59,8 @@ def band_limited_wave(
     columns = 2 * fx[1] * torch.cos(2 * math.pi * dx[:, None] * fx[0])
     rows = 2 * fy[1] * torch.cos(2 * math.pi * dy[:, None] * fy[0])
     total = torch.zeros(len(dy), len(dx), dtype=torch.complex128, device=dy.device)
-    for begin in range(0, len(fy[0]), 256):
-        part = slice(begin, begin + 256)
+    for start in range(0, len(fy[0]), 256):
+        part = slice(start, start + 256)
         spectrum = point_spectrum(fy[0][part, None], fx[0][None], wavelength, depth)
         total += rows[:, part].to(spectrum) @ (spectrum @ columns.T.to(spectrum))
     return total

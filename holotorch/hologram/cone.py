@@ -26,7 +26,7 @@ from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH
 from holotorch.optics.free_space.geometry import lateral_spread
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 
 Cone = Literal["full", "box", "disc", "taper", "band"]
 Samples = TypeVar("Samples", Tensor, np.ndarray)
@@ -81,8 +81,8 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     """
     square = dy.square() + dx.square()
     distance = torch.sqrt(depth**2 + square)
-    carrier = turns_phasor(torch.tensor(depth / wavelength, dtype=torch.float64, device=dy.device))
-    wave = turns_phasor(square / (distance + depth) / wavelength) * (carrier / distance)
+    carrier = cycles_phasor(torch.tensor(depth / wavelength, dtype=torch.float64, device=dy.device))
+    wave = cycles_phasor(square / (distance + depth) / wavelength) * (carrier / distance)
     if cone == "full":
         return wave
     spread = lateral_spread(Grid(1, pitch), wavelength, depth)

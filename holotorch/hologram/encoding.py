@@ -85,9 +85,9 @@ def iterated(
     field = _checked(field)
     if not field.numel():  # an empty batch, for which FFTs raise an error
         return torch.angle(field)
-    wanted = propagate(field)
+    target = propagate(field)
     power = field.abs().square().mean((-2, -1), keepdim=True)
-    strength = wanted.abs() * power.clamp(min=torch.finfo(power.dtype).tiny).rsqrt()
+    strength = target.abs() * power.clamp(min=torch.finfo(power.dtype).tiny).rsqrt()
     phase = torch.angle(field)
     for _ in range(steps):
         there = propagate(phasor(phase))
@@ -101,11 +101,11 @@ def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]
     The first intensity is multiplied by the factor that minimises the error. ``view`` propagates holograms [..., H, W]
     to the image plane, including any aperture.
     """
-    wanted, shown = intensity(view(field)), intensity(view(phasor(phase)))
+    target, shown = intensity(view(field)), intensity(view(phasor(phase)))
     tiny = torch.finfo(shown.dtype).tiny
-    scale = (wanted * shown).sum((-2, -1)) / shown.square().sum((-2, -1)).clamp(min=tiny)
-    error = (scale[..., None, None] * shown - wanted).square().sum((-2, -1))
-    return error / wanted.square().sum((-2, -1)).clamp(min=tiny)
+    scale = (target * shown).sum((-2, -1)) / shown.square().sum((-2, -1)).clamp(min=tiny)
+    error = (scale[..., None, None] * shown - target).square().sum((-2, -1))
+    return error / target.square().sum((-2, -1)).clamp(min=tiny)
 
 
 def _checked(field: Tensor) -> Tensor:

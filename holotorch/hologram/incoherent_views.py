@@ -51,7 +51,7 @@ def incoherent_views(layers: SourceLayers, wavelengths: Wavelengths, views: Sequ
         spectrum = real_fft2(light.double(), padded.shape)
         for v, view in enumerate(views):
             sums[v] = sums[v] + spectrum * _spread(padded, wavelength, view, depth - view.focus).to(light.device)
-    images = real_ifft2(torch.stack([torch.as_tensor(each) for each in sums], 1), padded.shape)
+    images = real_ifft2(torch.stack([torch.as_tensor(part) for part in sums], 1), padded.shape)
     return images[..., :height, :width].clamp(min=0).to(dtype)
 
 

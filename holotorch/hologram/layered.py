@@ -32,7 +32,7 @@ class LayerHologram(nn.Module):
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
         super().__init__()
-        if any(isinstance(each, Tensor) and each.requires_grad for each in (wavelength, depths, *depths)):
+        if any(isinstance(value, Tensor) and value.requires_grad for value in (wavelength, depths, *depths)):
             raise ValueError(
                 f"{type(self).__name__} has fixed wavelength and depths, whose gradients would be lost here: propagate "
                 "each plane with holotorch.optics.propagate and a distance that requires a gradient, and add the fields"

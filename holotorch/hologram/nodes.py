@@ -47,9 +47,9 @@ class Nodes:
         phasors = np.exp(2j * math.pi * np.fmod(np.asarray(depths) * self.centre, 1.0))[:, None]
         if self.width == 1:
             return np.rint(positions).astype(int).tolist(), phasors
-        begin = np.ceil(positions - self.width / 2).astype(int)
-        offset = 2 * (begin[:, None] + np.arange(self.width) - positions[:, None]) / self.width
-        return begin.tolist(), np.i0(self._beta * np.sqrt(np.clip(1 - offset**2, 0, None))) * phasors
+        start = np.ceil(positions - self.width / 2).astype(int)
+        offset = 2 * (start[:, None] + np.arange(self.width) - positions[:, None]) / self.width
+        return start.tolist(), np.i0(self._beta * np.sqrt(np.clip(1 - offset**2, 0, None))) * phasors
 
     def response(self, frequency: Samples) -> Samples:
         """Fourier transform of the window; ``frequency`` is axial frequency minus ``centre``, in cycles per metre."""
@@ -73,8 +73,8 @@ class Nodes:
         response, errors = self.response(frequency), []
         for fraction in np.linspace(0, 1, 16, endpoint=False):
             depth = self.first + (self.width + fraction) * self.spacing
-            (begin,), weights = self.weights([depth])
-            nodes = self.first + (begin + np.arange(self.width)) * self.spacing
+            (start,), weights = self.weights([depth])
+            nodes = self.first + (start + np.arange(self.width)) * self.spacing
             ratio = np.exp(2j * math.pi * np.outer(frequency, nodes - depth)) @ weights[0] / response
             errors.append(ratio * np.exp(-2j * math.pi * math.fmod(depth * self.centre, 1.0)) - 1)
         return float(np.sqrt(np.mean(np.abs(errors) ** 2)))

@@ -52,10 +52,10 @@ class Axis:
         Light from any plane at more than the first angle reaches no pixel. In FFTs of ``length`` samples, light wraps
         onto a pixel only at more than the second angle.
         """
-        begin = self.displacement * self.pitch / self.nearest
+        start = self.displacement * self.pitch / self.nearest
         end = (length - self.displacement) * self.pitch / self.farthest
         # For "full" the spectrum falls to 0 at the highest frequency at the latest, since a sharp end causes ringing.
-        return begin, min(end, self.steepest) if self.cone == "full" else end
+        return start, min(end, self.steepest) if self.cone == "full" else end
 
     @property
     def within_band(self) -> bool:
@@ -110,9 +110,9 @@ def _exact_kernel(axis: Axis, length: int, depth: float) -> np.ndarray:
     return axis.pitch * wave * np.exp(1j * k * (x**2 / (distance + depth)))
 
 
-def faded_out(values: Samples, begin: float, end: float) -> Samples:
+def faded_out(values: Samples, start: float, end: float) -> Samples:
     """Smooth step from 1 at abs(values) = ``begin`` to 0 at ``end``, with three continuous derivatives."""
-    t: Any = ((abs(values) - begin) / max(end - begin, 1e-12)).clip(0, 1)
+    t: Any = ((abs(values) - start) / max(end - start, 1e-12)).clip(0, 1)
     return 1 - t**4 * (35 - 84 * t + 70 * t**2 - 20 * t**3)
 
 

@@ -100,7 +100,7 @@ class DirectHologram(LayerHologram):
             if has_light(wave):
                 pairs = []
                 for step in (offset, -offset) if offset else (0,):
-                    inside = slice(*(sum(each < end - step for each in positions) for end in (0, height)))
+                    inside = slice(*(sum(position < end - step for position in positions) for end in (0, height)))
                     pairs.append((inside, rows[inside] + step))
                 yield wave.as_strided((len(columns), pixels), (stride, 1)).clone(), pairs
 

@@ -30,12 +30,12 @@ def load_heat_kernel(path: Path | str) -> Tensor:
             values = np.load(io.BytesIO(data), allow_pickle=False)
         else:
             text = data.decode("utf-8")
-            delimiter = next((each for each in ",;\t" if each in text), None)
+            delimiter = next((character for character in ",;\t" if character in text), None)
             values = np.loadtxt(io.StringIO(text), delimiter=delimiter, ndmin=2)
         if values.ndim != 2 or values.dtype.kind not in "iuf":
             raise ValueError(f"got {values.dtype} of shape {values.shape}")
     except (ValueError, OSError, EOFError, MemoryError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        wanted = "expected a table of temperature rises, a line for each row of pixels"
-        raise ValueError(f"{path}: {wanted}: {reason}") from None
+        expected = "expected a table of temperature rises, a line for each row of pixels"
+        raise ValueError(f"{path}: {expected}: {reason}") from None
     return torch.from_numpy(values.astype(np.float64))

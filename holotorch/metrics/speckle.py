@@ -1,14 +1,13 @@
 """Speckle contrast, power spectrum, grain size and anisotropy, dark spots and sharpness, each of a single picture."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.core.fourier import fft2
+from holotorch.core.fourier import expands, fft2
 from holotorch.core.precision import at_least_single
 
 _BAND = (0.05, 0.25)  # default band of sharpness, in cycles per sample; excludes the coarsest and finest detail
@@ -47,7 +46,7 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
     elif mask.dtype != torch.bool:
         raise TypeError(f"mask must be bool, got {mask.dtype}")
     for name, part in (("mask", mask), ("reference", reference)):
-        if part is not None and not _expandable(part.shape, intensity.shape):
+        if part is not None and not expands(part, intensity):
             raise ValueError(f"{name} must match intensity {tuple(intensity.shape)}, got {tuple(part.shape)}")
     weight = mask.to(intensity.dtype).expand(intensity.shape)
     count = weight.sum((-2, -1), keepdim=True)
@@ -161,11 +160,6 @@ def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float]
     if not torch.compiler.is_compiling() and (power == 0).any():
         raise ValueError(f"reference has no detail between {low:g} and {high:g} cycles per sample")
     return (observed * true.conj()).real.sum((-2, -1)) / power
-
-
-def _expandable(shape: Sequence[int], whole: Sequence[int]) -> bool:
-    pairs = zip(reversed(shape), reversed(whole), strict=False)
-    return len(shape) <= len(whole) and all(size in (1, full) for size, full in pairs)
 
 
 def _width(power: Tensor, level: float) -> Tensor:

@@ -150,20 +150,20 @@ def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: f
             positive birefringence gives, most likely because they are wrapped.
     """
     lengths = checks.wavelengths(wavelengths)
-    wanted = torch.tensor([checks.positive("phase", phase, "rad") for phase in phases], dtype=torch.float64)
-    if len(lengths) != len(wanted) or len(set(lengths)) < 2:
+    measured = torch.tensor([checks.positive("phase", phase, "rad") for phase in phases], dtype=torch.float64)
+    if len(lengths) != len(measured) or len(set(lengths)) < 2:
         raise ValueError(
             f"a Cauchy fit needs at least two different wavelengths with one phase each, got "
-            f"{len(lengths)} wavelengths ({len(set(lengths))} different) and {len(wanted)} phases"
+            f"{len(lengths)} wavelengths ({len(set(lengths))} different) and {len(measured)} phases"
         )
     length = checks.positive("path", path, "metres")
     unit = 1e-6  # wavelengths in micrometres make the two columns of the matrix similar in size
     inverse = unit / torch.tensor(lengths, dtype=torch.float64)
     matrix = 2 * math.pi * torch.stack([inverse, inverse**3], 1)
-    solution = torch.linalg.lstsq(matrix, wanted[:, None]).solution[:, 0]
-    residuals = wanted - matrix @ solution
+    solution = torch.linalg.lstsq(matrix, measured[:, None]).solution[:, 0]
+    residuals = measured - matrix @ solution
     a, b = solution[0].item() * unit / length, solution[1].item() * unit**3 / length
-    if min(a + b / each**2 for each in lengths) <= 0:
+    if min(a + b / wavelength**2 for wavelength in lengths) <= 0:
         raise ValueError(
             "no positive birefringence gives these phases; expected unwrapped ones, falling with wavelength"
         )

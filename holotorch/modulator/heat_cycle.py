@@ -58,8 +58,8 @@ class HeatCycle(PreciseModule):
         without_graph("time_constant", time_constant)
         self.crosstalk = crosstalk
         self.frame_time = checks.positive("frame_time", frame_time, "seconds")
-        self.moments = tuple(checks.finite("moments", each) for each in moments)
-        if not self.moments or not all(0 <= each <= 1 for each in self.moments):
+        self.moments = tuple(checks.finite("moments", moment) for moment in moments)
+        if not self.moments or not all(0 <= moment <= 1 for moment in self.moments):
             raise ValueError(f"moments must be fractions of a frame in 0 .. 1, at least one, got {moments!r}")
         is_tensor = isinstance(time_constant, Tensor)
         value = time_constant.detach() if is_tensor else torch.tensor(time_constant, dtype=torch.float64)

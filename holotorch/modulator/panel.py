@@ -1,4 +1,4 @@
-"""PhaseModulator: the field that a liquid-crystal panel with discrete grey levels emits for a wanted phase."""
+"""PhaseModulator: the field that a liquid-crystal panel with discrete grey levels emits for a target phase."""
 
 import hashlib
 import math
@@ -30,7 +30,7 @@ def even_lut(bits: int, full_turn: float | None = None) -> Tensor:
 
 
 def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
-    """Grey level whose phase modulo 2 pi is nearest to the wanted phase, int64 of the shape of ``phase``.
+    """Grey level whose phase modulo 2 pi is nearest to the target phase, int64 of the shape of ``phase``.
 
     Args:
         phase: In rad, of any size.
@@ -41,8 +41,8 @@ def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
     circle = torch.cat([circle[-1:] - math.tau, circle, circle[:1] + math.tau])
     order = torch.cat([order[-1:], order, order[:1]])
     borders = ((circle[1:] + circle[:-1]) / 2).to(phase.device)
-    wanted = torch.remainder(phase.detach().double(), math.tau).contiguous()
-    return order.to(phase.device)[torch.bucketize(wanted, borders)]
+    target = torch.remainder(phase.detach().double(), math.tau).contiguous()
+    return order.to(phase.device)[torch.bucketize(target, borders)]
 
 
 def snapped(phase: Tensor, lut: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ def quantisation_rms(lut: Tensor) -> float:
 
 
 class PhaseModulator(PreciseModule):
-    """Emitted field of one panel, complex [..., C, H, W], for a wanted phase, real [..., C, H, W] in rad.
+    """Emitted field of one panel, complex [..., C, H, W], for a target phase, real [..., C, H, W] in rad.
 
     The phase is rounded to that of the nearest grey level (:func:`snapped`), smoothed by the fringing fields between
     pixels, and scaled by dispersion if the light has another wavelength than the calibration. Fringing is a convolution
@@ -148,7 +148,7 @@ class PhaseModulator(PreciseModule):
         return tuple(quantisation_rms(row) for row in self._rows().detach())
 
     def forward(self, phase: Tensor, light: float | Sequence[float] | Tensor | None = None) -> Tensor:
-        """Emitted field [..., C, H, W] for a wanted phase [..., C, H, W].
+        """Emitted field [..., C, H, W] for a target phase [..., C, H, W].
 
         ``light``: Wavelengths of the illumination in metres, which broadcast against [..., C]; by default those of the
         calibration.
@@ -156,7 +156,7 @@ class PhaseModulator(PreciseModule):
         return self.emitted(self.shown(phase), light)
 
     def shown(self, phase: Tensor) -> Tensor:
-        """Phase [..., C, H, W] of the levels nearest to a wanted phase, see :func:`snapped`."""
+        """Phase [..., C, H, W] of the levels nearest to a target phase, see :func:`snapped`."""
         self._check(phase)
         rows = [snapped(phase[..., c, :, :], row) for c, row in enumerate(self._rows())]
         return torch.stack(rows, -3)
@@ -244,15 +244,15 @@ def level_of(phase: Tensor, lut: Tensor) -> Tensor:
     Raises ValueError for phases outside the range of the table.
     """
     sign = 1 if lut[-1] >= lut[0] else -1
-    table, wanted = sign * lut.double(), sign * phase.double()
+    table, target = sign * lut.double(), sign * phase.double()
     low, high = table.detach()[0], table.detach()[-1]
-    if bool(((wanted.detach() < low) | (wanted.detach() > high)).any()):
+    if bool(((target.detach() < low) | (target.detach() > high)).any()):
         raise ValueError(
             f"phases must lie in the table's range, {lut.min().item():g} to {lut.max().item():g} rad, got "
             f"{phase.min().item():g} to {phase.max().item():g}"
         )
-    row = torch.bucketize(wanted.detach(), table.detach()).clamp(1, len(table) - 1)
-    return row - 1 + (wanted - table[row - 1]) / (table[row] - table[row - 1])
+    row = torch.bucketize(target.detach(), table.detach()).clamp(1, len(table) - 1)
+    return row - 1 + (target - table[row - 1]) / (table[row] - table[row - 1])
 
 
 def _fraction(name: str, value: float, *, allow_zero: bool = False) -> float:

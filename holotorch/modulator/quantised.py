@@ -13,7 +13,7 @@ def quantised(phase: Tensor, bits: int) -> Tensor:
     Raises ValueError for fewer than 1 or more than 24 bits, or a negative phase.
     """
     checks.real("phase", phase)
-    checked_bits(bits, most=24)
+    checked_bits(bits, maximum=24)
     if phase.numel() and phase.detach().min() < 0:
         raise ValueError(f"phase must be >= 0 to be quantised, got a minimum of {phase.detach().min().item():g}")
     top = phase.detach().amax((-2, -1), keepdim=True)
@@ -22,8 +22,8 @@ def quantised(phase: Tensor, bits: int) -> Tensor:
     return phase + (stepped - phase.detach())
 
 
-def checked_bits(bits: int, most: int = 16) -> int:
-    """``bits``, or TypeError unless it is an integer and ValueError unless it is 1 to ``most``."""
-    if checks.whole("bits", bits, 1) > most:
-        raise ValueError(f"bits must be at most {most}, got {bits}")
+def checked_bits(bits: int, maximum: int = 16) -> int:
+    """``bits``, or TypeError unless it is an integer and ValueError unless it is 1 to ``maximum``."""
+    if checks.whole("bits", bits, 1) > maximum:
+        raise ValueError(f"bits must be at most {maximum}, got {bits}")
     return bits

@@ -56,9 +56,9 @@ def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
             raise ValueError(f"{name} must be [..., H, W], got {tuple(part.shape)}")
     if intensity.shape[:-2] != reference.shape[:-2]:
         raise ValueError(f"channels must match, got {tuple(intensity.shape)} and {tuple(reference.shape)}")
-    mean, wanted = (at_least_single(part).mean((-2, -1), keepdim=True) for part in (intensity, reference))
+    mean, target = (at_least_single(part).mean((-2, -1), keepdim=True) for part in (intensity, reference))
     black = mean == 0
-    return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, mean)).to(intensity.dtype)
+    return intensity * torch.where(black, 0.0, target / torch.where(black, 1.0, mean)).to(intensity.dtype)
 
 
 def tone_map(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:

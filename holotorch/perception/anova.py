@@ -128,8 +128,8 @@ def _beta_fraction(a: float, b: float, x: float, y: float) -> float:
     return front * value
 
 
-def error_freedom(f: float, p: float, between: int, *, f_step: float, p_step: float, most: int = 1000) -> list[int]:
-    """All degrees of freedom of the error, 1 to ``most``, with which a printed F has its printed p-value.
+def error_freedom(f: float, p: float, between: int, *, f_step: float, p_step: float) -> list[int]:
+    """All degrees of freedom of the error, 1 to 1000, with which a printed F has its printed p-value.
 
     Args:
         f: Printed statistic.
@@ -137,12 +137,11 @@ def error_freedom(f: float, p: float, between: int, *, f_step: float, p_step: fl
         between: Degrees of freedom of the hypothesis.
         f_step: Last printed digit of F, such as 0.01 for 7.02; the true F is within half a step.
         p_step: Last printed digit of p, such as 1e-4 for 0.0002.
-        most: The greatest number to try.
     """
     low, high = p - p_step / 2, p + p_step / 2
     return [
         error
-        for error in range(1, most + 1)
+        for error in range(1, 1001)
         if p_of_f(f - f_step / 2, (between, error)) >= low and p_of_f(f + f_step / 2, (between, error)) <= high
     ]
 

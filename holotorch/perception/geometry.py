@@ -72,10 +72,10 @@ class Display:
         """Angle in degrees between the fixation point and points of the display."""
         return eccentricity_of(*self.angles(y_px, x_px))
 
-    def eccentricity_map(self, *, dtype: torch.dtype = torch.float64) -> Tensor:
-        """Eccentricity of every pixel centre in degrees, [H, W]."""
+    def eccentricity_map(self) -> Tensor:
+        """Eccentricity of every pixel centre in degrees, float64 [H, W]."""
         y, x = (torch.arange(side, dtype=torch.float64) for side in self.shape)
-        return self.eccentricity(y[:, None], x[None, :]).to(dtype)
+        return self.eccentricity(y[:, None], x[None, :])
 
     def shows(self, elevation_deg: Any, azimuth_deg: Any) -> Tensor:
         """Whether each direction meets a pixel of the display; bool [...]."""

@@ -24,17 +24,17 @@ class AdaptivePicture:
     Attributes:
         image: Radiance in the colours of the transfer function, [C, h, w].
         opacity: Opacity in [0, 1], [h, w].
-        followed: Whether the ray of a pixel was computed, bool [h, w]; the other pixels are interpolated.
+        traced: Whether the ray of a pixel was computed, bool [h, w]; the other pixels are interpolated.
     """
 
     image: Tensor
     opacity: Tensor
-    followed: Tensor
+    traced: Tensor
 
     @property
     def share(self) -> float:
         """Fraction of the rays that were computed."""
-        return self.followed.double().mean().item()
+        return self.traced.double().mean().item()
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ def sample_adaptively(
     with torch.no_grad():
         first = torch.cat([part.reshape(-1, *sampler.grid.shape) for part in sampler.render(volume, lattice.coarse)])
         fine = lattice.fine(first)
-    followed = lattice.coarse | fine
-    return sampler(volume, followed, lambda radiance: torch.where(fine, radiance, lattice.filled(radiance))), followed
+    traced = lattice.coarse | fine
+    return sampler(volume, traced, lambda radiance: torch.where(fine, radiance, lattice.filled(radiance))), traced
 
 
 @torch.no_grad()

@@ -153,11 +153,11 @@ def optical_depth(density: Tensor, spacing: Triple, towards: Tensor) -> Tensor:
     at its samples. Outside the volume the density is 0.
     """
     axis = int(towards.abs().argmax())
-    order = [axis, *(each for each in range(3) if each != axis)]
+    order = [axis, *(other for other in range(3) if other != axis)]
     behind = towards[axis] > 0  # the light is behind the last slice
     swept = density.permute(order).flip(0) if behind else density.permute(order)
     step = spacing[axis] / abs(towards[axis].item())  # metres along the ray from one slice to the next
-    y, x = (step * towards[each].item() / spacing[each] for each in order[1:])
+    y, x = (step * towards[other].item() / spacing[other] for other in order[1:])
     count, height, width = swept.shape
     # The ray through sample p of slice k has the number p + k * shift.
     (above, below), (left, right) = (
@@ -171,7 +171,7 @@ def optical_depth(density: Tensor, spacing: Triple, towards: Tensor) -> Tensor:
         depths.append(depth[above : above + height, left : left + width])
         whole = whole + along
     result = torch.stack(depths[::-1] if behind else depths)
-    return result.permute([order.index(each) for each in range(3)])
+    return result.permute([order.index(i) for i in range(3)])
 
 
 def shifted(image: Tensor, samples: tuple[float, float]) -> Tensor:

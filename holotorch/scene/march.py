@@ -72,10 +72,10 @@ class March:
         thickness = max(min(high, far) - max(low, near) for low, high in self.spans)
         return max(0.0, thickness) / min(self.place.spacing)
 
-    def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
+    def steps(self, selected: Tensor | None = None) -> Iterator[Step]:
         """Yield the contributions of the planes, front to back; planes without a contribution are left out.
 
-        ``wanted``, bool [h, w], selects the rays to compute; None means all.
+        ``selected``, bool [h, w], selects the rays to compute; None means all.
         """
         if not self.window.size:
             return
@@ -84,9 +84,9 @@ class March:
         rotation = torch.tensor(place.rotation, dtype=torch.float64, device=self.device)
         near, far = place.depth_range()
         transmittance = self.zeros(1)[0] + 1
-        if wanted is not None:
+        if selected is not None:
             rows, columns = self.window.rows, self.window.columns
-            transmittance = transmittance * wanted[rows.start : rows.stop, columns.start : columns.stop].flatten()
+            transmittance = transmittance * selected[rows.start : rows.stop, columns.start : columns.stop].flatten()
         for plane, (low, high) in enumerate(self.spans):
             alive = transmittance.detach() > self.early
             if self.known and not alive.any():
@@ -103,25 +103,25 @@ class March:
             transmittance.index_copy_(0, sampled.rays, after)
             yield Step(plane, sampled.rays, weight, colour)
 
-    def picture(self, wanted: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Colours [C, h, w] and opacity [h, w], summed along each ray; ``wanted`` as in :meth:`steps`."""
+    def picture(self, selected: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Colours [C, h, w] and opacity [h, w], summed along each ray; ``selected`` as in :meth:`steps`."""
         image, opacity = self.zeros(self.channels), self.zeros(1)
-        for step in self.steps(wanted):
+        for step in self.steps(selected):
             image.index_add_(1, step.rays, step.weight * step.colour)
             opacity.index_add_(1, step.rays, step.weight[None])
         return self.whole(image), self.whole(opacity)[0]
 
     def amplitudes(
-        self, wanted: Tensor | None = None, fill: Callable[[Tensor], Tensor] | None = None
+        self, selected: Tensor | None = None, fill: Callable[[Tensor], Tensor] | None = None
     ) -> Iterator[Tensor]:
         """Yield the square root of the radiance, [C, h, w], for every plane.
 
-        ``wanted`` as in :meth:`steps`; ``fill`` completes the radiance of a plane, for rays parallel to the axis.
+        ``selected`` as in :meth:`steps`; ``fill`` completes the radiance of a plane, for rays parallel to the axis.
         """
         # One zero, expanded to the shape of a plane without allocating it.
         dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(self.channels, *self.rays.grid.shape)
         done = 0
-        for step in self.steps(wanted):
+        for step in self.steps(selected):
             yield from [dark] * (step.plane - done)
             done = step.plane + 1
             scale, radiance = self.rays.scale(self.depths[step.plane]), step.weight * step.colour

@@ -188,9 +188,9 @@ def check_planes(
         raise ValueError(f"boundaries must be one more than the {len(planes)} depths, got {len(edges)}")
     if len(planes) == 1 and edges[1] < edges[0]:
         sign = -1
-    for k, (depth, (begin, end)) in enumerate(zip(planes, itertools.pairwise(edges), strict=True)):
-        if not sign * begin <= sign * depth <= sign * end or begin == end:
-            raise ValueError(f"plane {k} at {depth:g} m must lie within its slab, got {begin:g} to {end:g} m")
+    for k, (depth, (start, end)) in enumerate(zip(planes, itertools.pairwise(edges), strict=True)):
+        if not sign * start <= sign * depth <= sign * end or start == end:
+            raise ValueError(f"plane {k} at {depth:g} m must lie within its slab, got {start:g} to {end:g} m")
     return planes, edges
 
 

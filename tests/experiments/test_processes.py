@@ -150,7 +150,7 @@ def divided(rank: int) -> list[torch.Tensor]:
     (gradient,) = torch.autograd.grad(formed.square().sum(), field)
     with pytest.raises(ConnectionError, match="fields of the processes differ"):
         shared(field.detach() + rank)
-    return [field.detach(), formed.detach(), gradient, torch.tensor(shared.own(field).numel())]
+    return [field.detach(), formed.detach(), gradient, torch.tensor(shared.local(field).numel())]
 
 
 def test_two_processes_form_the_intensities_of_one(tmp_path):

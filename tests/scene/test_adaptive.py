@@ -30,17 +30,17 @@ def test_followed_rays_are_right_and_the_rest_lies_between_them(step):
     made = sampler()
     whole, opacity = made.render(ball())
     found = render_adaptively(made, ball(), step=step, contrast=0.02)
-    torch.testing.assert_close(found.image[:, found.followed], whole[:, found.followed], rtol=0, atol=0)
-    torch.testing.assert_close(found.opacity[found.followed], opacity[found.followed], rtol=0, atol=0)
-    assert found.followed[::step, ::step].all() and found.followed[-1, -1]
+    torch.testing.assert_close(found.image[:, found.traced], whole[:, found.traced], rtol=0, atol=0)
+    torch.testing.assert_close(found.opacity[found.traced], opacity[found.traced], rtol=0, atol=0)
+    assert found.traced[::step, ::step].all() and found.traced[-1, -1]
     if step == 1:
-        assert found.followed.all()
+        assert found.traced.all()
         return
-    filled = ~found.followed
+    filled = ~found.traced
     assert filled.float().mean() > 0.15
     # Neighbouring corners differ by up to the contrast, so does what is between them.
     assert (found.image - whole)[:, filled].abs().max() < 0.02
-    torch.testing.assert_close(made.render(ball(), found.followed)[1], opacity * found.followed, rtol=0, atol=0)
+    torch.testing.assert_close(made.render(ball(), found.traced)[1], opacity * found.traced, rtol=0, atol=0)
 
 
 def test_linear_pictures_are_filled_in_exactly():
@@ -91,7 +91,7 @@ def test_sources_between_the_rays_have_the_light_of_the_adaptive_picture():
     made = sampler()
     layers, followed = sample_adaptively(made, ball(), contrast=0.4)
     found = render_adaptively(made, ball(), contrast=0.4)
-    assert torch.equal(followed, found.followed) and 0.06 < followed.double().mean() < 0.6
+    assert torch.equal(followed, found.traced) and 0.06 < followed.double().mean() < 0.6
     light = torch.stack(list(layers.amplitudes())).square()
     torch.testing.assert_close(light.sum(0), found.image, rtol=1e-10, atol=1e-12)
     exact = torch.stack(list(made(ball()).amplitudes())).square()

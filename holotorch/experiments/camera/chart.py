@@ -106,7 +106,7 @@ def calibrated(drives: Tensor, images: Tensor) -> tuple[Chip, dict[str, Tensor]]
 def _recovered(noise: float, captures: int, seed: int) -> tuple[dict[str, Any], Chip]:
     """Table row of one calibration, and the model."""
     true = true_chip()
-    begin = time.perf_counter()
+    start = time.perf_counter()
     model, deviations = calibrated(*captured(true, noise, captures, seed))
     drives = torch.linspace(0, LIMIT, 200, dtype=torch.float64)
     with torch.no_grad():
@@ -124,7 +124,7 @@ def _recovered(noise: float, captures: int, seed: int) -> tuple[dict[str, Any], 
         "response_error_rad": response,
         "sigma_deviations": _ratio(errors["crosstalk.sigma"], deviations["crosstalk.sigma"]),
         "distance_deviations": _ratio(errors["propagator.distance"], deviations["propagator.distance"]),
-        "seconds": time.perf_counter() - begin,
+        "seconds": time.perf_counter() - start,
     }
     return row, model
 

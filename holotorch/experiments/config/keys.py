@@ -68,18 +68,18 @@ def meaning(model: type[BaseModel], name: str) -> str:
     for owner in model.__mro__:
         if not issubclass(owner, BaseModel) or name not in owner.model_fields:
             break
-        if (words := MEANINGS.get(f"{owner.__name__}.{name}")) is not None:
-            return words
-        if words := _explained(owner, name):
-            return words
+        if (text := MEANINGS.get(f"{owner.__name__}.{name}")) is not None:
+            return text
+        if text := _explained(owner, name):
+            return text
     return MEANINGS.get(name, "")
 
 
 def _explained(model: type[BaseModel], name: str) -> str:
     """What the docstring of a section says after ````name````: up to the next name or the end of the sentence."""
     text = " ".join((inspect.getdoc(model) or "").split())
-    found = re.search(rf"``{name}``(?:, ``\w+``)*(?: \([^)]*\))?: (.+?)(?=(?:[;.] ``\w+``)|$)", text)
-    return found[1].rstrip(".").replace("``", "") if found else ""
+    match = re.search(rf"``{name}``(?:, ``\w+``)*(?: \([^)]*\))?: (.+?)(?=(?:[;.] ``\w+``)|$)", text)
+    return match[1].rstrip(".").replace("``", "") if match else ""
 
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -99,8 +99,8 @@ def _quantity(parts: Sequence[Any]) -> str:
     for part in parts:
         if isinstance(part, BeforeValidator) and (name := _QUANTITIES.get(getattr(part.func, "__name__", ""))):
             return name
-        if found := _quantity([*typing.get_args(part), *getattr(part, "__metadata__", ())]):
-            return found
+        if quantity := _quantity([*typing.get_args(part), *getattr(part, "__metadata__", ())]):
+            return quantity
     return ""
 
 

@@ -54,8 +54,8 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     if kind == "missing":
         return source.mistake(key, "required, but missing")
     if kind in ("union_tag_not_found", "union_tag_invalid"):
-        wanted = entry["ctx"].get("expected_tags", "")
-        options = re.findall(r"'([^']+)'", wanted)
+        expected = entry["ctx"].get("expected_tags", "")
+        options = re.findall(r"'([^']+)'", expected)
         options = options or [tag for option in _options_at(model, entry["loc"]) for tag in _tags(option)]
         got = given.get("kind", "none") if isinstance(given, dict) else given
         hint = nearest(str(got), options)
@@ -66,13 +66,13 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         bound, name = ("least", "min_length") if kind == "too_short" else ("most", "max_length")
         number, got = entry["ctx"][name], entry["ctx"]["actual_length"]
         return source.mistake(key, f"expected at {bound} {number} {'entry' if number == 1 else 'entries'}, got {got}")
-    wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
-    wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
-    near = difflib.get_close_matches(str(given)[:100].lower(), re.findall(r"'([^']+)'", wanted), 1)
+    expected = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
+    expected = expected or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
+    near = difflib.get_close_matches(str(given)[:100].lower(), re.findall(r"'([^']+)'", expected), 1)
     # A text has a unit already, so only numbers get the hint that a unit is missing.
     hint = entry["ctx"]["hint"] if kind == "quantity" and not isinstance(given, str) else ""
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
-    return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else hint))
+    return source.mistake(key, f"expected {expected}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else hint))
 
 
 def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str, chosen: bool) -> str:

@@ -23,8 +23,8 @@ def metres(value: Any) -> Any:
     if isinstance(value, str):
         match = _LENGTH.fullmatch(value.strip())
         if not match or (match[2] and match[2] not in _POWERS):
-            wanted = "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
-            raise PydanticCustomError("length", wanted)
+            expected = "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
+            raise PydanticCustomError("length", expected)
         try:
             return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # decimal, so that 0.57 um is 5.7e-07
         except ArithmeticError:  # the exponent is too large
@@ -61,8 +61,8 @@ def kelvin(value: Any) -> Any:
     if isinstance(value, str):
         if match := _RISE.fullmatch(value.strip()):
             return float(match[1])
-        wanted = "expected a temperature above ambient such as 500 degC, or a number of degrees"
-        raise PydanticCustomError("temperature", wanted)
+        expected = "expected a temperature above ambient such as 500 degC, or a number of degrees"
+        raise PydanticCustomError("temperature", expected)
     return number(value)
 
 
@@ -73,12 +73,12 @@ def number(value: Any) -> Any:
     return value
 
 
-def within(least: float, most: float, words: str) -> AfterValidator:
-    """A validator of the range from ``least`` to ``most``, which ``words`` describe in the message."""
+def within(minimum: float, maximum: float, expected: str) -> AfterValidator:
+    """A validator of the range from ``minimum`` to ``maximum``, which ``expected`` describes in the message."""
 
     def check(value: float) -> float:
-        if not least <= value <= most:
-            raise PydanticCustomError("range", "expected {words}", {"words": words})
+        if not minimum <= value <= maximum:
+            raise PydanticCustomError("range", "expected {words}", {"words": expected})
         return value
 
     return AfterValidator(check)

@@ -23,7 +23,7 @@ from holotorch.experiments.timing import timed
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.io.bundled import find_config
 from holotorch.optics.light.spectral import spectral_image
-from holotorch.optics.light.wavelength_sampling import neighbour_error, seen_light, select_wavelengths
+from holotorch.optics.light.wavelength_sampling import neighbour_error, pupil_illumination, select_wavelengths
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
 from holotorch.optics.viewing.imaging import propagate_collapsed
 from holotorch.optics.viewing.retina import plan_retina
@@ -110,11 +110,11 @@ def _methods(observer: Observer) -> list[dict]:
     return rows
 
 
-def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
-    """The sampling ``least`` with ``factor`` times as many samples along each axis."""
-    fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in least.fine)
-    times = tuple(m * now / size for m, now, size in zip(least.oversampling, fine, least.fine, strict=True))
-    return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
+def _scaled(sampling: ElementSampling, factor: float) -> ElementSampling:
+    """``sampling`` with ``factor`` times as many samples along each axis."""
+    fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in sampling.fine)
+    times = tuple(m * now / size for m, now, size in zip(sampling.oversampling, fine, sampling.fine, strict=True))
+    return replace(sampling, oversampling=times, fine=fine)  # type: ignore[arg-type]
 
 
 def _counts(observer: Observer, amount: Amount) -> list[dict]:
@@ -126,7 +126,7 @@ def _counts(observer: Observer, amount: Amount) -> list[dict]:
     depth, wavelength, grid = observer.focus[0], observer.scene.settings.wavelengths[1], observer.scene.grid
     hologram, _ = observer.scene.hologram(0)
     field, eye = hologram[1].conj(), observer.eye(depth)
-    light = seen_light(grid, wavelength, observer.display, eye, reach=observer.scene.width / 2)
+    light = pupil_illumination(grid, wavelength, observer.display, eye, reach=observer.scene.width / 2)
 
     def image(wavelengths: Tensor, weights: Tensor, count: int) -> Tensor:
         return spectral_image(field, grid, wavelengths, weights, observer.display, eye, count=count)

@@ -25,7 +25,7 @@ from holotorch.optics.light.displaced import displaced_eye, displacement
 from holotorch.optics.light.incoherent import disc_source, tilted_wave
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.spectrum import Spectrum
-from holotorch.optics.light.wavelength_sampling import least_followed, seen_light
+from holotorch.optics.light.wavelength_sampling import least_count, pupil_illumination
 from holotorch.optics.picture import equal_power
 from holotorch.optics.viewing.display import Display
 from holotorch.optics.viewing.display_geometry import eyepiece_distance, image_distance
@@ -119,17 +119,17 @@ class Observer:
             # The error of the sum and that of deriving pictures are independent; each may be tolerance / sqrt(2).
             eye, tolerance = self.eye(depth), self.budget.share(WAVELENGTHS) / math.sqrt(2)
             half_width = self.scene.width / 2
-            light = seen_light(self.scene.grid, wavelength, self.display, eye, reach=half_width)
+            light = pupil_illumination(self.scene.grid, wavelength, self.display, eye, reach=half_width)
             if not light.path_difference:
-                words = f"no light of {wavelength * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
+                problem = f"no light of {wavelength * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
                 hint = "change the distances of display, or the pupil"
-                raise ConfigError([f"display: {words} {depth * 1e3:.4g} mm from the hologram; {hint}"])
+                raise ConfigError([f"display: {problem} {depth * 1e3:.4g} mm from the hologram; {hint}"])
             spectrum = PRESETS[source](wavelength)
             samples = spectrum.samples(tolerance=tolerance, path_difference=light.path_difference, iris=False)
             count = (
                 len(samples[0])
                 if self.separate
-                else least_followed(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
+                else least_count(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
             )
             self._samples[key] = *samples, count
         return self._samples[key]
@@ -234,7 +234,7 @@ class Observer:
         wavelengths = self.scene.settings.wavelengths
         samples = [self.samples(source, wavelength, depth) for wavelength in wavelengths]
         difference = path_difference(depth, self.aperture(depth))
-        best = [optimum_fwhm(each, self.detail(depth, each), depth) for each in wavelengths]
+        best = [optimum_fwhm(wavelength, self.detail(depth, wavelength), depth) for wavelength in wavelengths]
         quality = ssim((shown / peak).clamp(0, 1), (reference / peak).expand_as(shown), data_range=1.0)
         return {
             "source": source,
@@ -257,8 +257,8 @@ def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Obse
     """
     pitch, longest = min(scene_settings.hologram.pitch), max(scene_settings.wavelengths)
     if pitch <= longest / 2:
-        words = f"expected more than {longest / 2:.4g} m, half the longest wavelength, got {pitch:g} m"
-        raise ConfigError([f"hologram.pitch: {words}"])
+        problem = f"expected more than {longest / 2:.4g} m, half the longest wavelength, got {pitch:g} m"
+        raise ConfigError([f"hologram.pitch: {problem}"])
     budget = observer_budget(settings, scene_settings)
     # The scene is not refocused, so that its tolerance is that of its hologram alone.
     hologram = scene_settings.hologram.model_copy(update={"tolerance": budget.share(HOLOGRAM)})

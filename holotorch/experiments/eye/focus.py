@@ -125,7 +125,7 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
                 total[f] += eye.image(hologram, None, position)
                 bar.update()
     pictures, wavelength = total / settings.realisations, eye.reference_wavelength
-    details, wanted = _fine_detail(pictures), _fine_detail(surface.rendering[None].float())[0]
+    details, reference = _fine_detail(pictures), _fine_detail(surface.rendering[None].float())[0]
     bands = []
     ends = torch.linspace(low, high, settings.bands + 1).tolist()
     for near, far in pairwise(ends):
@@ -133,7 +133,7 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
         if int(part.sum()) < _LEAST:
             continue
         mean = depth[part].mean().item()
-        correlation = tuple(_correlation(detail[:, part], wanted[:, part]) for detail in details)
+        correlation = tuple(_correlation(detail[:, part], reference[:, part]) for detail in details)
         spread, depth_of_focus = depth[part].std().item(), wavelength / eye.detail(mean, wavelength) ** 2
         position, inside = parabola_peak(focus, correlation)
         sharpest = position if inside else math.nan

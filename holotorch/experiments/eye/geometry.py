@@ -49,7 +49,7 @@ def geometry(eye: Observer) -> dict[str, Any]:
     sines = [min(w / (2 * pitch), math.sin(math.atan(width / 2 / scene.distance))) for w in wavelengths]
     values["eye_box_mm"] = [1e3 * viewing.eye_box(scene.width, first, second, sine) for sine in sines]
     spread = abs(second) * np.array(sines)  # radius of the light of the scene's centre on the pupil's plane
-    values["light_in_pupil"] = [float(min(1.0, pupil / each) ** 2) for each in spread]
+    values["light_in_pupil"] = [float(min(1.0, pupil / width) ** 2) for width in spread]
     values["light_of_edge"] = [viewing.vignetting(scene.width / 2, first, second, pupil, sine) for sine in sines]
     if isinstance(display, MagnifyingSettings):
         to_lens = float(eye.display.lens_distance) - scene.distance
@@ -91,7 +91,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
         f"the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near "
         f"end, {spots[1]} um at the far end",
     ]
-    return [*lines, *(f"WARNING    {words}" for words in warnings(values))]
+    return [*lines, *(f"WARNING    {warning}" for warning in warnings(values))]
 
 
 def warnings(values: dict[str, Any]) -> list[str]:

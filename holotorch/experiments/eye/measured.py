@@ -17,16 +17,15 @@ def observer_errors(eye: Observer) -> list[Comparison]:
 
     The error of the propagation to the retina is not measured, since its prediction excludes shifts of the picture.
     """
-    words = "not measured: the prediction excludes shifts of the picture; for points of light see holotorch chart eye"
-    retina = Comparison(RETINA, eye.budget.error(RETINA), None, words)
+    note = "not measured: the prediction excludes shifts of the picture; for points of light see holotorch chart eye"
+    retina = Comparison(RETINA, eye.budget.error(RETINA), None, note)
     return [hologram_error(eye.scene), wavelength_error(eye), retina]
 
 
-def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
+def wavelength_error(eye: Observer) -> Comparison:
     """Error of the picture of the widest source, for the middle colour and focus and the first realisation.
 
-    In the reference each wavelength in steps of 1 nm is propagated, by the method of the plan. ``limit`` is in seconds
-    on the reference machine of ``planning.machine``.
+    In the reference each wavelength in steps of 1 nm is propagated, by the method of the plan.
     """
     colour = len(eye.scene.settings.wavelengths) // 2
     depth, wavelength = eye.focus[len(eye.focus) // 2], eye.scene.settings.wavelengths[colour]
@@ -41,7 +40,7 @@ def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
         pictures = plan.flops * FLOP_SECONDS[plan.method] * len(lengths)
         return hologram_seconds(eye.scene, machine) + pictures * machine.fft(plan.memory_bytes / 8)
 
-    if seconds(Machine()) > limit:
+    if seconds(Machine()) > LIMIT:
         return not_measured(WAVELENGTHS, predicted, seconds(machine_speed(eye.scene.device)))
     few = eye.samples(source, wavelength, depth)
     light = eye.scene.hologram(eye.settings.seed)[0][colour].conj()
@@ -52,5 +51,5 @@ def wavelength_error(eye: Observer, limit: float = LIMIT) -> Comparison:
     ]
     error = relative_error(*(pooled(image, eye.scene.stride) for image in images))
     name = source.replace("_", " ")
-    words = f"{few[2]} propagated of {len(few[0])} for the {name} at {wavelength * 1e9:.0f} nm, against all"
-    return Comparison(WAVELENGTHS, predicted, error, f"{words} {len(lengths)} in steps of 1 nm")
+    note = f"{few[2]} propagated of {len(few[0])} for the {name} at {wavelength * 1e9:.0f} nm, against all"
+    return Comparison(WAVELENGTHS, predicted, error, f"{note} {len(lengths)} in steps of 1 nm")

@@ -41,27 +41,27 @@ def plan_values(eye: Observer) -> dict[str, Any]:
     directions = [len(eye.points(wavelength, deepest)[0]) for wavelength in wavelengths]
 
     def pictures(per_source: dict[str, list[int]]) -> int:
-        pairs = (pair for each in per_source.values() for pair in zip(each, directions, strict=True))
+        pairs = (pair for samples in per_source.values() for pair in zip(samples, directions, strict=True))
         return settings.seeds * sum(count * tilts for count, tilts in pairs)
 
     references = 8 * settings.seeds
     images = references * len(wavelengths) + pictures(propagated)
     derived = pictures(counts) - pictures(propagated)
     retina = [eye.retina(depth) for depth in eye.focus]
-    eye.budget.predict(RETINA, max(each.predicted_error for each in retina))
+    eye.budget.predict(RETINA, max(choice.predicted_error for choice in retina))
     volume, machine, pixels = volume_plan.plan_values(scene), machine_speed(scene.device), math.prod(scene.grid.shape)
     fft = machine.fft(pixels)
     seconds = {
         "holograms": volume_plan.hologram_seconds(scene, machine) * (references + settings.seeds),
         "pictures": fft
         * (
-            images * sum(each.flops * FLOP_SECONDS[each.method] for each in retina)
+            images * sum(choice.flops * FLOP_SECONDS[choice.method] for choice in retina)
             + derived * len(retina) * _DERIVED_SECONDS * pixels * math.log2(pixels)
         ),
         "start-up and figures": machine.around(figures=2 + len(retina)),
     }
     geometry = eye_geometry.geometry(eye)
-    peaks = [_BASE_BYTES + _MARGIN * each.memory_bytes + _DERIVED_BYTES * pixels for each in retina]
+    peaks = [_BASE_BYTES + _MARGIN * choice.memory_bytes + _DERIVED_BYTES * pixels for choice in retina]
     return {
         "scene": _scene(eye),
         "synthetic": scene.synthetic,
@@ -114,10 +114,10 @@ def _shallow(eye: Observer) -> list[str]:
 def _scene(eye: Observer) -> str:
     """The volume in words: that of the configuration with the view of the scene, or the volume of the scene."""
     scene, own = eye.settings.scene.config, eye.settings.volume
-    words = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
+    source = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
     if changes := eye.settings.scene.change:
-        words += f" and scene.change: {', '.join(changes)}"
-    return "; ".join(filter(None, (words, volume_plan.preset_note(eye.scene))))
+        source += f" and scene.change: {', '.join(changes)}"
+    return "; ".join(filter(None, (source, volume_plan.preset_note(eye.scene))))
 
 
 def plan_text(eye: Observer, values: dict[str, Any]) -> str:
@@ -132,7 +132,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         f"{', '.join(f'{sine:.3g}' for sine in values['aperture'])}",
         *eye_geometry.in_words(values["geometry"]),
     ]
-    for method in dict.fromkeys(each["method"] for each in values["retina"]):
+    for method in dict.fromkeys(choice["method"] for choice in values["retina"]):
         plans = [pair for pair in zip(depths, values["retina"], strict=True) if pair[1]["method"] == method]
         depth, worst = max(plans, key=lambda pair: pair[1]["predicted_error"])
         where = f" (largest error, at {depth:.4g} mm)" if len(plans) > 1 else ""
@@ -167,11 +167,11 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  in addition, at {where} mm, by collapsed propagation; the cost above excludes it")
     first = len(eye_geometry.warnings(values["geometry"]))  # printed above, with the numbers of the geometry
-    return "\n".join([*lines, *(f"WARNING    {words}" for words in values["warnings"][first:])])
+    return "\n".join([*lines, *(f"WARNING    {warning}" for warning in values["warnings"][first:])])
 
 
 def too_large(values: dict[str, Any]) -> str | None:
     """Error message if the run does not fit into the free memory, otherwise None."""
     text = shortage(values)
-    elements = any(each["method"] == "elements" for each in values["retina"])
+    elements = any(choice["method"] == "elements" for choice in values["retina"])
     return f"{text}, or a larger tolerance" if text and elements else text

@@ -36,15 +36,15 @@ def eye_section(run: RunRecord) -> list[str]:
     first = summary["rows"][0]
     at = f" at {' / '.join(f'{wavelength:.0f}' for wavelength in summary['wavelengths_nm'])} nm"
     names = [key.replace("_", " ") + (at if isinstance(first[key], list) else "") for key in first]
-    parts += [element("p", f"Warning: {words}.", "warn") for words in plan.get("warnings", [])]
+    parts += [element("p", f"Warning: {warning}.", "warn") for warning in plan.get("warnings", [])]
     parts.append(table(names, [[_cell(value) for value in row.values()] for row in summary["rows"]]))
     parts.append(element("p", _PREDICTED))
-    if words := error_sentence(summary):
-        parts.append(element("p", words))
+    if sentence := error_sentence(summary):
+        parts.append(element("p", sentence))
     return [*parts, element("h2", "Plan"), element("pre", plan.get("text", plain(plan)))]
 
 
 def _cell(value: Any) -> str:
     if not isinstance(value, list):
         return plain(value)
-    return " / ".join("-" if each is None else f"{each:.3g}" for each in value)
+    return " / ".join("-" if item is None else f"{item:.3g}" for item in value)

@@ -51,12 +51,12 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     scene = load_config(path, list(settings.scene.change))
     if not isinstance(scene, VolumeSettings):
         raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {scene.experiment!r}"])
-    own = {
+    overrides = {
         name: value for name in ("volume", "transfer", "wavelengths") if (value := getattr(settings, name)) is not None
     }
-    scene = scene.model_copy(update=own)
+    scene = scene.model_copy(update=overrides)
     if problems := contradictions(scene):
-        raise ConfigError([f"{'.'.join(map(str, key))}: {words}" for key, words in problems])
+        raise ConfigError([f"{'.'.join(map(str, key))}: {problem}" for key, problem in problems])
     return scene
 
 
@@ -71,7 +71,7 @@ def visible_surface(eye: Observer) -> eye_focus.Surface | None:
 def run_observer(eye: Observer, opened: RunFolder) -> bool:
     """Compute the observer's view, or this process's part of it, and fill the folder; True if the run is complete."""
     if process_count()[0] > 0:
-        _Views(eye, None).compute(opened.pressed)
+        _Views(eye, None).compute(opened.signals)
         return True
     settings, folder, files = eye.settings, opened.path, Results()
     errors: dict[str, Any] | None = None
@@ -80,7 +80,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
     files.write(write_bytes, folder / "images" / "geometry.png", eye_geometry.draw(eye))
     views = _Views(eye, Checkpoint(folder / "checkpoint.pt", _fingerprint(eye)))
     try:
-        views.compute(opened.pressed)
+        views.compute(opened.signals)
         if settings.sweep:
             sweep = eye_focus.focus_sweep(eye, settings.sweep, surface)
             files.write(write_table, folder / "focus.csv", [band.row for band in sweep.bands])
@@ -98,7 +98,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
     except KeyboardInterrupt:
         if not views.references:
             raise
-    with deferred(opened.pressed):
+    with deferred(opened.signals):
         summary = {"experiment": "eye", "status": "", "realisations": len(views.pictures)}
         if not views.pictures:
             opened.write_page = None  # there is nothing to show yet
@@ -153,7 +153,7 @@ class _Views:
         """Mean picture of the reference for each focus, [F, C, h, w]."""
         return self.total / self.references
 
-    def compute(self, pressed: list[int]) -> None:
+    def compute(self, signals: list[int]) -> None:
         """Compute the remaining pictures. A signal saves the complete realisations and raises KeyboardInterrupt."""
         sources, seeds = self.eye.settings.light.sources, self.eye.settings.seeds
         # A realisation has one step of the progress bar for the hologram, and one for each picture.
@@ -165,16 +165,16 @@ class _Views:
             try:
                 for seed in range(_REFERENCE_SEED + references, _REFERENCE_SEED + 8 * seeds):
                     picture = self._pictures(seed, (None,), bar)[0]
-                    with deferred(pressed):
+                    with deferred(signals):
                         self.total, self.references = self.total + picture, self.references + 1
-                    self._save_if_due(pressed)
+                    self._save_if_due(signals)
                 for seed in range(pictures, seeds):
                     self.pictures.append(self._pictures(seed, sources, bar))
-                    self._save_if_due(pressed)
+                    self._save_if_due(signals)
             finally:
-                with deferred(pressed):
+                with deferred(signals):
                     self._save()
-            if pressed:
+            if signals:
                 raise KeyboardInterrupt
 
     def _pictures(self, seed: int, sources: Sequence[str | None], bar: tqdm) -> Tensor:
@@ -191,8 +191,8 @@ class _Views:
             bar.update()
         return added(torch.stack(pictures)).unflatten(0, (len(sources), -1))
 
-    def _save_if_due(self, pressed: list[int]) -> None:
-        if pressed:  # a signal arrived while signals were deferred
+    def _save_if_due(self, signals: list[int]) -> None:
+        if signals:  # one arrived while they were deferred
             raise KeyboardInterrupt
         if time.perf_counter() - self._saved > _SAVE_EVERY:
             self._save()

@@ -13,9 +13,9 @@ from holotorch.metrics import anisotropy, grain_size, power_spectrum
 _RINGS = 24  # number of rings of a radial mean of the spectrum
 
 
-def relative_speckle(pictures: Tensor, reference: Tensor, least: Tensor) -> Tensor:
-    """``pictures`` [..., h, w] divided by the speckle-free ``reference``; 1 where that is at most ``least``."""
-    lit = reference > least
+def relative_speckle(pictures: Tensor, reference: Tensor, minimum: Tensor) -> Tensor:
+    """``pictures`` [..., h, w] divided by the speckle-free ``reference``; 1 where that is at most ``minimum``."""
+    lit = reference > minimum
     return torch.where(lit, pictures / torch.where(lit, reference, 1), 1)
 
 
@@ -54,7 +54,7 @@ def draw(speckle: dict[str, Tensor]) -> bytes:
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     for source, values in speckle.items():
-        frequency, power = (each.tolist() for each in radial_spectrum(values))
+        frequency, power = (curve.tolist() for curve in radial_spectrum(values))
         axes.semilogy(frequency, [max(value, 1e-12) for value in power], ".-", label=source.replace("_", " "))
     axes.set(xlabel="frequency (cycles per sample of the picture)", ylabel="power of the relative speckle")
     axes.grid(alpha=0.3)

@@ -112,7 +112,7 @@ def tradeoff(
         holograms = [eye.scene.hologram(seed)[0] for seed in range(seeds)]
         reference_holograms = [eye.scene.hologram(_REFERENCE_SEED + seed)[0] for seed in range(others)]
         for colour, wavelength in enumerate(moved.wavelengths):
-            images = torch.stack([_image(eye, each[colour], wavelength) for each in reference_holograms])
+            images = torch.stack([_image(eye, field[colour], wavelength) for field in reference_holograms])
             reference = seed_statistics(images).mean
             cases.append(_case(eye, colour, wavelength, holograms, reference, similarity))
     return cases
@@ -199,7 +199,7 @@ def in_words(cases: list[Case]) -> list[str]:
     Each optimum is compared with the formula whose prefactor was fitted to the cases at the other distances.
     """
     inside = [case for case in cases if case.inside]
-    expected = {case: case.formula(fitted_prefactor([each for each in inside if each.distance != case.distance]))
+    expected = {case: case.formula(fitted_prefactor([other for other in inside if other.distance != case.distance]))
                 for case in cases}  # fmt: skip
     off = [case.best / expected[case] - 1 for case in inside if not math.isnan(expected[case])]
     judged = f"off by {min(off):+.0%} to {max(off):+.0%}" if off else "which only several distances could test"

@@ -39,7 +39,7 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
             if name in SHARED:
                 baseline(experiment, name)
         return True
-    out, pressed, files = opened.path, opened.pressed, Results()
+    out, pressed, files = opened.path, opened.signals, Results()
     (out / "arrays").mkdir(exist_ok=True)
     log = Log(experiment, Checkpoint(out / "checkpoint.pt", _fingerprint(experiment)))
     try:

@@ -49,9 +49,9 @@ class MeasuredCatheter:
         save_catheter(path, self.catheter)
 
 
-def known_distances(words: Sequence[str]) -> list[int | tuple[int, int]]:
+def known_distances(arguments: Sequence[str]) -> list[int | tuple[int, int]]:
     """Known distances from words: ``i`` for edge i and the tip, ``i-j`` for two edges, counted from 0."""
-    parts = [[int(number) for number in word.split("-")] for word in words]
+    parts = [[int(number) for number in word.split("-")] for word in arguments]
     return [part[0] if len(part) == 1 else (part[0], part[1]) for part in parts]
 
 
@@ -73,7 +73,7 @@ def measure_catheter(
         text = "the edges are measured in the frames: expected a video, a folder, a recording or a camera"
         raise ConfigError([f"{source.name}: {text}, got poses"])
     camera, nominal = source.inputs.camera, source.inputs.catheter
-    whole = [each for each in pixels if each is not None and bool(each.isfinite().all())]
+    whole = [points for points in pixels if points is not None and bool(points.isfinite().all())]
     if not whole:
         text = f"none of {len(pixels)} frames shows all {len(nominal.edges)} edges; show the whole catheter, well lit"
         raise ConfigError([f"{source.name}: {text}"])

@@ -27,7 +27,7 @@ def _words(value: Any) -> Any:
     """A list whose whole numbers, as YAML reads 0, become text."""
     if not isinstance(value, list | tuple):
         return value
-    return tuple(str(each) if isinstance(each, int) and not isinstance(each, bool) else each for each in value)
+    return tuple(str(item) if isinstance(item, int) and not isinstance(item, bool) else item for item in value)
 
 
 def _exposure(value: Any) -> Any:

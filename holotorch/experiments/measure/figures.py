@@ -43,7 +43,7 @@ def edges_figure(changes: Sequence[float], deviations: Sequence[float]) -> bytes
     """Changes of the positions of edges 0, 1, ... with bars of two standard deviations, all in mm."""
     figure = Figure(figsize=(6, 3.2), layout="constrained")
     axes = figure.add_subplot()
-    axes.errorbar(range(len(changes)), changes, [2 * each for each in deviations], fmt="o", capsize=4)
+    axes.errorbar(range(len(changes)), changes, [2 * deviation for deviation in deviations], fmt="o", capsize=4)
     axes.axhline(0, color="0.6", linewidth=0.8)
     axes.set(xlabel="edge", ylabel="measured - nominal (mm)", xticks=range(len(changes)))
     return figure_png(figure)

@@ -115,8 +115,8 @@ def measure_section(record: RunRecord) -> list[str]:
         names = [method["method"] for method in faces]
     columns = [*zip(names, faces, strict=True), *([("mean", summary)] if len(summary.get("faces", [])) > 1 else [])]
     cells = [
-        [words, *(_number(face.get(key)) for _, face in columns), THESIS[protocol].get(key, "")]
-        for key, words in ROWS[protocol]
+        [label, *(_number(face.get(key)) for _, face in columns), THESIS[protocol].get(key, "")]
+        for key, label in ROWS[protocol]
         if any(key in face for _, face in columns) or key in THESIS[protocol]
     ]
     parts.append(table(["", *(name for name, _ in columns), "dissertation"], cells))
@@ -149,15 +149,15 @@ def verdict(summary: Mapping[str, Any]) -> str:
         return f"{protocol:10} differs from sRGB by {_number(summary['from_srgb'])} of the light of level 255 at most"
     faces = summary.get("faces", [])
     values = dict(summary) | (faces[0] if len(faces) == 1 else {})
-    words = []
+    sentences = []
     for key, text in ROWS[protocol]:
         if isinstance(value := values.get(key), float) and key.endswith(("_mm", "_ms")):
             beside = THESIS[protocol].get(key)
             name = text.replace(" (mm)", "").replace(" (ms)", "")
-            words.append(
+            sentences.append(
                 f"{name} {_number(value)} {key.rsplit('_')[-1]}" + (f" (dissertation {beside})" if beside else "")
             )
-    return f"{protocol:10} " + "; ".join(words[:4])
+    return f"{protocol:10} " + "; ".join(sentences[:4])
 
 
 def _number(value: Any) -> str:

@@ -1,6 +1,5 @@
 """Runs of a measurement: tracks or reads its sources, guides the hand at a live camera, and writes the results."""
 
-import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked
-from holotorch.io.files import write_bytes
+from holotorch.io.files import without_nan, write_bytes
 from holotorch.tracking import Pose
 
 _LOOKS = 10  # frames at the beginning in which the chessboard of the sheet is searched, which takes up to a second each
@@ -113,7 +112,7 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     if settings.protocol == "tone":  # photographs, which show no catheter
         tracks = [Track(source, Log(folder.path / "images")) for source in experiment.sources]
     else:
-        tracks = [_followed(settings, source, folder, files, i) for i, source in enumerate(experiment.sources)]
+        tracks = [_tracked(settings, source, folder, files, i) for i, source in enumerate(experiment.sources)]
     summary: dict[str, Any] = {"experiment": "measure", "status": "", "protocol": settings.protocol}
     summary |= {"sources": [source.name for source in experiment.sources]}
     summary |= {"frames": sum(len(track.poses) for track in tracks)}
@@ -131,12 +130,12 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     files.write(write_bytes, folder.path / "images" / "measure.png", result.figure[0])
     for name, save in result.saved.items():
         files.write(save, folder.path / name)
-    complete = conclude(folder, _finite(summary), files, done=True)
+    complete = conclude(folder, without_nan(summary), files, done=True)
     print(verdict(summary), *(note for note in result.notes if note not in announced), sep="\n", flush=True)
     return complete
 
 
-def _followed(settings: MeasureSettings, source: Source, folder: RunFolder, files: Results, number: int) -> Track:
+def _tracked(settings: MeasureSettings, source: Source, folder: RunFolder, files: Results, number: int) -> Track:
     """The track of a source; its poses and YAML files are written if they were tracked from frames."""
     track = Track(source, Log(folder.path / "images"))
     guide = Guide(settings, Grid.of(settings)) if source.live and settings.protocol in GRIDS else None
@@ -144,20 +143,20 @@ def _followed(settings: MeasureSettings, source: Source, folder: RunFolder, file
     try:
         with tqdm(total=total, unit="frame", desc=settings.protocol, dynamic_ncols=True) as bar:
             for item in _looked(settings, source, track):
-                with deferred(folder.pressed):
+                with deferred(folder.signals):
                     track.take(item)
                     bar.update()
                     done = guide is not None and guide(item.frame.seconds, item.pose)
-                if done or folder.pressed:
+                if done or folder.signals:
                     break
     except KeyboardInterrupt:
         pass  # whether it ends the run is decided below
     finally:
         if source.inputs is not None:
-            with deferred(folder.pressed):
+            with deferred(folder.signals):
                 source.inputs.frames.__exit__()
                 _keep(track, folder.path, files, f"{number + 1}" if len(settings.source) > 1 else "")
-    if not track.poses or (folder.pressed and not source.live):
+    if not track.poses or (folder.signals and not source.live):
         raise KeyboardInterrupt
     return track
 
@@ -190,12 +189,3 @@ def restart_measurement(folder: Path, config: dict[str, Any]) -> str | None:
     if not any(isinstance(name, str | int) and str(name) != SYNTHETIC and is_camera(str(name)) for name in names):
         return None
     return f"the frames of a camera are gone; poses that it has found are in {folder / 'poses.csv'}: measure those"
-
-
-def _finite(value: Any) -> Any:
-    """JSON values without NaN and infinity, which become None."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

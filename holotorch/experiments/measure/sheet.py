@@ -18,11 +18,11 @@ _BELOW = 25.0  # mm: for the scale bar and its words
 _BAR = 100.0  # mm
 
 
-def chessboard(words: str) -> Chessboard:
+def chessboard(text: str) -> Chessboard:
     """The chessboard of a configuration. ConfigError for another board or an invalid one."""
-    board = parse_board(words.split())
+    board = parse_board(text.split())
     if isinstance(board, Charuco):
-        raise ConfigError([f"grid.board: expected a chessboard, as the sheet shows one, got {words!r}"])
+        raise ConfigError([f"grid.board: expected a chessboard, as the sheet shows one, got {text!r}"])
     return board
 
 

@@ -128,27 +128,27 @@ def read_reference(path: Path) -> Reference:
     Raises:
         ConfigError: The file cannot be read, a column is missing, or a line is no time and place.
     """
-    wanted = ("time_s", "x_m", "y_m", "z_m")
+    columns = ("time_s", "x_m", "y_m", "z_m")
     times, tips = [], []
     try:
         with open(path, newline="", encoding="utf-8") as stream:
             table = csv.DictReader(stream)
-            if not set(wanted) <= set(table.fieldnames or ()):
+            if not set(columns) <= set(table.fieldnames or ()):
                 got = ", ".join(table.fieldnames or ["nothing"])
-                raise ConfigError([f"{path}:1: expected the columns {', '.join(wanted)}, got {got}"])
+                raise ConfigError([f"{path}:1: expected the columns {', '.join(columns)}, got {got}"])
             for line in table:
                 try:
-                    seconds, *tip = (float(line[name] or math.nan) for name in wanted)
+                    seconds, *tip = (float(line[name] or math.nan) for name in columns)
                     if not math.isfinite(seconds) or (times and seconds <= times[-1]):
                         raise ValueError
                 except (TypeError, ValueError):
-                    got = ",".join(str(line[name]) for name in wanted)
+                    got = ",".join(str(line[name]) for name in columns)
                     text = "a time in seconds later than that of the line before, and a place in metres"
                     raise ConfigError([f"{path}:{table.line_num}: expected {text}, got {got}"]) from None
                 times.append(seconds)
                 tips.append(tip)
     except (UnicodeDecodeError, csv.Error):
-        raise ConfigError([f"{path}: not a table in UTF-8 text; expected the columns {', '.join(wanted)}"]) from None
+        raise ConfigError([f"{path}: not a table in UTF-8 text; expected the columns {', '.join(columns)}"]) from None
     except OSError as error:
         raise ConfigError([f"{path}: cannot read the reference tracker's log: {error.strerror}"]) from None
     if not times:

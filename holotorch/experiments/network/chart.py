@@ -56,9 +56,9 @@ def network(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, byte
     problem = PECProblem(crosstalk, propagator, scale_free=True, amplitude=True)
     torch.manual_seed(0)
     model = PhaseUNet(propagator, limit=LIMIT)
-    begin = time.perf_counter()
+    start = time.perf_counter()
     losses = train(model, problem, Crops(trained, GRID.shape[0], amount.crops), steps=amount.training)
-    seconds = time.perf_counter() - begin
+    seconds = time.perf_counter() - start
     pictures = Crops(held, GRID.shape[0], amount.scored * len(held), seed=99)
     rows, shown = [], {}
     for k in tqdm(range(len(pictures)), desc="scoring", unit="picture"):
@@ -88,7 +88,7 @@ def _scores(
     shown: dict[str, Tensor],
 ) -> list[dict[str, Any]]:
     """Table rows of every contender on one target [1, 1, H, W]."""
-    own = PECProblem(problem.crosstalk, problem.propagator, target, scale_free=True, amplitude=True)
+    scored = PECProblem(problem.crosstalk, problem.propagator, target, scale_free=True, amplitude=True)
     cool = 3 + 0.3 * torch.rand(target.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         warm, ahead = _timed(lambda: model(target))
@@ -97,7 +97,7 @@ def _scores(
     for steps in budgets:
         solver = LBFGS(max_steps=steps)
         for name, start, before in (("L-BFGS", cool, 0.0), ("L-BFGS from the network", warm, ahead)):
-            phase, seconds = _timed(lambda s=solver, x=start: s(own, x, Box(0.0, LIMIT)).x)
+            phase, seconds = _timed(lambda s=solver, x=start: s(scored, x, Box(0.0, LIMIT)).x)
             rows.append(_row(picture, name, steps, quality(problem, phase, target), before + seconds))
             if steps == 10:
                 shown[f"10 steps of {name}"] = problem.intensity(phase)
@@ -117,9 +117,9 @@ def _timed(function) -> tuple[Tensor, float]:
     """The result, and the median of the seconds of a few calls."""
     seconds, result = [], torch.empty(0)
     for _ in range(ROUNDS):
-        begin = time.perf_counter()
+        start = time.perf_counter()
         result = function()
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.perf_counter() - start)
     return result, float(np.median(seconds))
 
 
@@ -147,7 +147,7 @@ def _verdict(rows: list[dict], seconds: float, trained: int, held: int, amount: 
         f"trained for {seconds:.0f} s on crops of {trained} pictures; scored on {amount.scored * held} crops of {held} "
         f"others, {GRID.shape[0]} px, one colour, one frame, on {torch.get_num_threads()} threads",
     ]
-    for steps in (each for each in (1, 10, 100) if each in amount.steps):
+    for steps in (count for count in (1, 10, 100) if count in amount.steps):
         lines.append(
             f"{steps} step(s) of L-BFGS: SSIM {cold[steps][0]:.3f} in {cold[steps][1]:.0f} ms; from the network "
             f"{warm[steps][0]:.3f} in {warm[steps][1]:.0f} ms, network included"

@@ -1,6 +1,5 @@
 """Training of a PhaseUNet: pictures, loss through the display, checkpoints, and several processes."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler, RandomSamp
 from tqdm import tqdm
 
 from holotorch.correction import PECProblem
+from holotorch.io.files import replacing
 from holotorch.io.images import load_image
 
 
@@ -33,17 +33,16 @@ class Crops(Dataset[Tensor]):
     def __getitem__(self, index: int) -> Tensor:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + index)
         picture = self.pictures[index % len(self.pictures)]
-        top, left = (
-            int(torch.randint(n - self.size + 1, (), generator=generator)) for n in picture.shape
-        )  # the same for every access
+        # The same for every access.
+        top, left = (int(torch.randint(n - self.size + 1, (), generator=generator)) for n in picture.shape)
         crop = picture[top : top + self.size, left : left + self.size]
         crop = crop.flip(-1) if index % 2 else crop
         return (crop / crop.mean().clamp(min=1e-3))[None]
 
 
-def _halved(picture: Tensor, least: int) -> Tensor:
-    """``picture`` [H, W] at half its resolution as often as both sides stay at least ``least`` pixels."""
-    while min(picture.shape) >= 2 * least:
+def _halved(picture: Tensor, minimum: int) -> Tensor:
+    """``picture`` [H, W] at half its resolution as often as both sides stay at least ``minimum`` pixels."""
+    while min(picture.shape) >= 2 * minimum:
         picture = nn.functional.avg_pool2d(picture[None], 2)[0]
     return picture
 
@@ -58,7 +57,6 @@ def train(
     rate: float = 1e-3,
     autocast: bool = False,
     checkpoint: Path | None = None,
-    seed: int = 0,
 ) -> list[float]:
     """Train ``network`` by AdamW on the loss of ``problem``, and return the losses of all steps.
 
@@ -75,7 +73,6 @@ def train(
         rate: First learning rate.
         autocast: Compute the convolutions in bfloat16; phases and light stay in float32.
         checkpoint: Path of the file, or None.
-        seed: Of the order of the pictures.
     """
     together = torch.distributed.is_available() and torch.distributed.is_initialized()
     share = batch // torch.distributed.get_world_size() if together else batch
@@ -94,7 +91,7 @@ def train(
     progress = tqdm(total=steps, initial=len(losses), desc="training", unit="step", disable=None)
     while len(losses) < steps:
         epoch = len(losses) // per_epoch
-        for k, target in enumerate(_epoch(pictures, share, seed + epoch, together)):
+        for k, target in enumerate(_epoch(pictures, share, epoch, together)):
             if k < len(losses) % per_epoch and k < len(losses) - epoch * per_epoch:
                 continue  # trained on before the checkpoint
             if len(losses) >= steps or k >= per_epoch:
@@ -130,6 +127,5 @@ def _save(path: Path, network: nn.Module, optimiser, schedule, losses: list[floa
         return
     state = {"network": network.state_dict(), "optimiser": optimiser.state_dict(),
              "schedule": schedule.state_dict(), "losses": losses}  # fmt: skip
-    temporary = path.with_suffix(".part")
-    torch.save(state, temporary)
-    os.replace(temporary, path)
+    with replacing(path) as stream:
+        torch.save(state, stream)

@@ -10,9 +10,9 @@ from holotorch.core.operator import LinearOperator
 
 
 class PhaseUNet(nn.Module):
-    """Heater phases [B, C, H, W] in rad, 0 to ``limit``, for wanted intensities [B, C, H, W].
+    """Heater phases [B, C, H, W] in rad, 0 to ``limit``, for target intensities [B, C, H, W].
 
-    The input of the network is the wanted amplitude, propagated back to the modulator with a flat phase: real and
+    The input of the network is the target amplitude, propagated back to the modulator with a flat phase: real and
     imaginary part for each colour. Diffraction is thus accounted for already, and the network, whose
     convolutions are local, corrects phase, amplitude and heat. H and W are multiples of 4.
 
@@ -34,7 +34,7 @@ class PhaseUNet(nn.Module):
         self.last = nn.Conv2d(width, channels, 3, padding=1)
 
     def forward(self, target: Tensor) -> Tensor:
-        """Phases for ``target``, the wanted intensity with a mean of 1."""
+        """Phases for ``target``, the target intensity with a mean of 1."""
         if target.ndim != 4 or target.shape[-1] % 4 or target.shape[-2] % 4:
             raise ValueError(
                 f"target must be (B, C, H, W) with H and W multiples of 4, got {tuple(target.shape)}; crop or pad it"

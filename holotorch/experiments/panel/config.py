@@ -141,8 +141,8 @@ def _table(row: CalibrationSettings, bits: int) -> torch.Tensor:
     levels, phases = zip(*row.lut, strict=True)
     top = 2**bits - 1
     if levels[0] != 0 or levels[-1] != top:
-        wanted = f"expected rows from level 0 to {top}, the top one of {bits} bits"
-        raise ValueError(f"{wanted}, got {levels[0]:g} to {levels[-1]:g}")
+        expected = f"expected rows from level 0 to {top}, the top one of {bits} bits"
+        raise ValueError(f"{expected}, got {levels[0]:g} to {levels[-1]:g}")
     return checked_lut(torch.from_numpy(np.interp(np.arange(top + 1), levels, phases)), bits)
 
 
@@ -154,11 +154,11 @@ def _read_points(path: Path) -> tuple[tuple[float, float], ...]:
         raise ValueError(f"cannot read {path}: {reason}") from None
     points = []
     for number, line in enumerate(lines, 1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if not words or (number == 1 and words[0].isalpha()):  # a comment, or a header of column names
+        cells = line.split("#")[0].replace(",", " ").split()
+        if not cells or (number == 1 and cells[0].isalpha()):  # a comment, or a header of column names
             continue
         try:
-            level, phase = map(float, words)
+            level, phase = map(float, cells)
         except ValueError:
             raise ValueError(f"{path}:{number}: expected a level and a phase in rad, got {line!r}") from None
         points.append((level, phase))

@@ -159,20 +159,20 @@ def _better(report: dict[str, Any]) -> list[str]:
     better = [Path(file).stem.split("_")[1] for file, loss, other in pairs if other < loss]
     if not better:
         return []
-    words = f"--encoding kinoform would be closer at {', '.join(better)}"
-    return [f"Better     {words}; behind an aperture in the Fourier plane double_phase is meant to be"]
+    advice = f"--encoding kinoform would be closer at {', '.join(better)}"
+    return [f"Better     {advice}; behind an aperture in the Fourier plane double_phase is meant to be"]
 
 
 def _window(hologram: Grid, panel: Grid, name: str) -> tuple:
     """Slices of the hologram in frames [..., H, W] of the panel."""
     if any(abs(a / b - 1) > 1e-4 for a, b in zip(hologram.pitch, panel.pitch, strict=True)):
         run, has = (" x ".join(f"{step * 1e6:g}" for step in grid.pitch) for grid in (hologram, panel))
-        words = f"the run was computed for pixels of {run} um, the panel {name} has {has} um"
-        raise ConfigError([f"{words}; run it again with its pitch"])
+        problem = f"the run was computed for pixels of {run} um, the panel {name} has {has} um"
+        raise ConfigError([f"{problem}; run it again with its pitch"])
     if any(a > b for a, b in zip(hologram.shape, panel.shape, strict=True)):
         run, has = (" x ".join(map(str, grid.shape)) for grid in (hologram, panel))
-        words = f"the hologram has {run} pixels, more than the {has} of the panel {name}"
-        raise ConfigError([f"{words}; use a smaller grid"])
+        problem = f"the hologram has {run} pixels, more than the {has} of the panel {name}"
+        raise ConfigError([f"{problem}; use a smaller grid"])
     # Hologram and panel share the optical axis, which is at sample n // 2 of n samples.
     begin = [large // 2 - small // 2 for large, small in zip(panel.shape, hologram.shape, strict=True)]
     return (..., *(slice(start, start + part) for start, part in zip(begin, hologram.shape, strict=True)))

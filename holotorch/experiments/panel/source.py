@@ -110,7 +110,7 @@ def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
     phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
 
     def picture(fields: Tensor) -> Tensor:
-        formed = [intensity(experiment.propagator(each.to(experiment.device))) for each in fields]
+        formed = [intensity(experiment.propagator(field.to(experiment.device))) for field in fields]
         return experiment.picture_in(torch.stack(formed).mean(0)).cpu()
 
     return PanelPhases(phase, experiment.wavelengths, experiment.grid, "phase", picture)
@@ -141,7 +141,7 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
     def picture(fields: Tensor) -> Tensor:
         return torch.stack([intensity(propagator(c)(fields[:, c])).mean(0) for c in range(fields.shape[1])])
 
-    phase = torch.stack([ENCODINGS[encoding](each) for each in hologram])
+    phase = torch.stack([ENCODINGS[encoding](field) for field in hologram])
     losses = {
         name: [encoding_loss(hologram[c], phases[c], propagator(c)).item() for c in range(len(hologram))]
         for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram)))
@@ -156,15 +156,15 @@ def _check_axes(folder: Path, experiment: PECExperiment, heaters: Tensor) -> Non
     """
     try:
         numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
-        wanted = None if numbers is None else torch.tensor(numbers, dtype=torch.float64)[experiment.lit]
+        light = None if numbers is None else torch.tensor(numbers, dtype=torch.float64)[experiment.lit]
     except (ValueError, AttributeError, TypeError, LookupError, RuntimeError):
         raise ValueError("summary.json is damaged: it does not say the heating power of each colour") from None
-    if not len(heaters) == heaters.shape[1] > 1 or wanted is None:
+    if not len(heaters) == heaters.shape[1] > 1 or light is None:
         return
 
     def fits(phases: Tensor) -> bool:
         power = experiment.array.temperature(phases[:, experiment.lit].double()).mean((0, -2, -1))
-        return torch.allclose(power, wanted, rtol=1e-3)
+        return torch.allclose(power, light, rtol=1e-3)
 
     if not fits(heaters) and fits(heaters.transpose(0, 1)):
         raise ValueError(
@@ -201,6 +201,6 @@ def run_array(path: Path, shape: tuple[int, ...], axes: str, dtype: str) -> Tens
     except Exception as error:  # damaged bytes may raise any exception
         raise ValueError(f"{path.name} cannot be read: {error}") from None
     if stated != (shape, dtype):
-        wanted = f"the shape {axes} = {shape} of its configuration in {dtype}"
-        raise ValueError(f"{path.name} must have {wanted}, got {stated[0]} in {stated[1]}")
+        expected = f"the shape {axes} = {shape} of its configuration in {dtype}"
+        raise ValueError(f"{path.name} must have {expected}, got {stated[0]} in {stated[1]}")
     return torch.from_numpy(values.copy())

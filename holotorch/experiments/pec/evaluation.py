@@ -71,7 +71,7 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     else:
         (y, x), (height, width) = experiment.grid.coordinates(phase.device), experiment.grid.extent
         half_a_sample = torch.exp(-1j * math.pi * (y / height + x / width))
-        between = experiment.mean_intensity(lambda each: experiment.array(each.double()) * half_a_sample, phase)
+        between = experiment.mean_intensity(lambda frame: experiment.array(frame.double()) * half_a_sample, phase)
         between = experiment.picture_in(between).cpu()
         if experiment.scale_free:
             between = between * _scale(experiment, formed)
@@ -84,8 +84,8 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
 def _heating(experiment: PECExperiment, phase: Tensor) -> dict[str, Any]:
     """Peak phase, and peak and mean temperature rises over all frames of heater phases [F, C, H, W]."""
     array, rows = experiment.array, []
-    for each in phase:  # one frame at a time, to save memory
-        driven = each.double()
+    for frame in phase:  # one frame at a time, to save memory
+        driven = frame.double()
         spread = array.crosstalk(driven)
         warm = array.temperature(spread)
         means = warm.mean((-2, -1)), array.temperature(driven).mean((-2, -1))
@@ -105,7 +105,7 @@ def speckle_spots(experiment: PECExperiment, phase: Tensor) -> Tensor:
 
 
 def _spots(experiment: PECExperiment, formed: Tensor) -> Tensor:
-    return dark_spots(formed / formed.mean((-2, -1), keepdim=True), experiment.wanted)
+    return dark_spots(formed / formed.mean((-2, -1), keepdim=True), experiment.normalised)
 
 
 def _efficiency(experiment: PECExperiment, formed: Tensor) -> list[float]:
@@ -115,7 +115,7 @@ def _efficiency(experiment: PECExperiment, formed: Tensor) -> list[float]:
 
 def _scale(experiment: PECExperiment, formed: Tensor) -> Tensor:
     """Factors [C, 1, 1] that fit an intensity [C, h, w] to the target by least squares."""
-    return best_scale(formed, experiment.wanted)[:, None, None]
+    return best_scale(formed, experiment.normalised)[:, None, None]
 
 
 def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
@@ -126,8 +126,8 @@ def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[st
         for j, distance in enumerate(experiment.distances):
             for k, offset in enumerate(((0.0, 0.0), (grid.pitch[0] / 2, grid.pitch[1] / 2))):
                 exact = CroppedKernel(grid, wavelength, distance, offset=offset).to(experiment.device)
-                for each in phase:
-                    field = experiment.array(each.double())[i : i + 1]
+                for frame in phase:
+                    field = experiment.array(frame.double())[i : i + 1]
                     images[k, i, j] += intensity(exact(field))[0].cpu() / len(phase)
     formed, between = experiment.picture_in(images[:, :, 0] if len(experiment.distances) == 1 else images)
     picture = _as_picture(experiment, formed, at_best_scale=True)
@@ -140,8 +140,8 @@ def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any
     """Scores of the intensity midway between four samples, against the mean of the four pixels of the target."""
     picture = _as_picture(experiment, between, at_best_scale=False)[..., :-1, :-1]
     image = experiment.image
-    wanted = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
-    return _scores(experiment, picture, wanted) if min(wanted.shape[-2:]) >= SSIM_WINDOW else {}
+    reference = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
+    return _scores(experiment, picture, reference) if min(reference.shape[-2:]) >= SSIM_WINDOW else {}
 
 
 def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[str, Any]:

@@ -113,21 +113,21 @@ class PECExperiment:
         return with_channels(fitted, len(settings.wavelengths)).contiguous()
 
     @property
-    def wanted(self) -> Tensor:
+    def normalised(self) -> Tensor:
         """Intensity of the lit colours of the picture, each scaled to mean 1, float64 [C, h, w]."""
         image = self.image[self.lit]
         return image / image.mean((-2, -1), keepdim=True)
 
     @property
     def target(self) -> Tensor:
-        """Wanted intensity [C, *image]; *image is (H, W), or (D, H, W) with the picture at each of D > 1 distances."""
-        wanted = self.wanted
+        """Target intensity [C, *image]; *image is (H, W), or (D, H, W) with the picture at each of D > 1 distances."""
+        normalised = self.normalised
         if region := self.settings.target.region:
-            whole = wanted.new_zeros(len(wanted), *self.grid.shape)
-            whole[self.window] = wanted
+            whole = normalised.new_zeros(len(normalised), *self.grid.shape)
+            whole[self.window] = normalised
             # The factor puts half of the light in the region. Its value is not critical, since the scale is fitted.
             return whole * (math.prod(self.grid.shape) / math.prod(region) / 2)
-        return wanted[:, None].repeat(1, len(self.distances), 1, 1) if len(self.distances) > 1 else wanted
+        return normalised[:, None].repeat(1, len(self.distances), 1, 1) if len(self.distances) > 1 else normalised
 
     @property
     def window(self) -> tuple[Any, ...]:
@@ -222,12 +222,12 @@ class PECExperiment:
 
     def intensity(self, phase: Tensor, dtype: torch.dtype | None = None) -> Tensor:
         """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W], by default in their dtype."""
-        return self.mean_intensity(lambda each: self.array(each.to(dtype or each.dtype)), phase)
+        return self.mean_intensity(lambda frame: self.array(frame.to(dtype or frame.dtype)), phase)
 
     def mean_intensity(self, emitted: Callable[[Tensor], Tensor], phase: Tensor) -> Tensor:
         """Mean intensity [C, *image] of the fields ``emitted`` for each frame of heater phases [F, C, H, W]."""
         # One frame at a time, since float64 fields at several depths take much memory.
-        images = (intensity(self.propagator(emitted(each))) for each in phase)
+        images = (intensity(self.propagator(emitted(frame))) for frame in phase)
         return sum(images, next(images)) / len(phase)
 
     def start_phase(self) -> Tensor:

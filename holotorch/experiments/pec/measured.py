@@ -46,7 +46,7 @@ def _heat(experiment: PECExperiment, phase: Tensor) -> tuple[float, str]:
     """Error of the kernel's taps, in double precision."""
     sigma_px = experiment.settings.modulator.sigma_px
     assert sigma_px is not None
-    complete = experiment.mean_intensity(lambda each: phasor(spread_completely(sigma_px, each.double())), phase)
+    complete = experiment.mean_intensity(lambda frame: phasor(spread_completely(sigma_px, frame.double())), phase)
     formed = experiment.intensity(phase, torch.float64)
     error = scaled_error(experiment.picture_in(formed), experiment.picture_in(complete))
     taps = experiment.array.crosstalk.kernel.shape[0]

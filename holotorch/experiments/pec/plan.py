@@ -247,14 +247,14 @@ def _physics(experiment: PECExperiment) -> dict[str, Any]:
         "height_mm": grid.extent[0] * 1e3,
         "width_mm": grid.extent[1] * 1e3,
         "pitch_um": [step * 1e6 for step in grid.pitch],
-        "field_of_view_deg": [2 * math.degrees(diffraction_angle(grid, each)[1]) for each in wavelengths],
+        "field_of_view_deg": [2 * math.degrees(diffraction_angle(grid, wavelength)[1]) for wavelength in wavelengths],
         "phase_response_rad_per_K": list(experiment.array.response),
         "kernel_sum": experiment.array.crosstalk.total,
     }
     if distances:
         values |= {
             "distance_mm": [distance * 1e3 for distance in distances],
-            "spot_um": [each * max(map(abs, distances)) / min(grid.extent) * 1e6 for each in wavelengths],
-            "alias_free_mm": [unaliased_distance(grid, each, 1) * 1e3 for each in wavelengths],
+            "spot_um": [wavelength * max(map(abs, distances)) / min(grid.extent) * 1e6 for wavelength in wavelengths],
+            "alias_free_mm": [unaliased_distance(grid, wavelength, 1) * 1e3 for wavelength in wavelengths],
         }
     return values

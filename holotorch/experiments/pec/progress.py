@@ -93,16 +93,16 @@ class Log:
         return self.checkpoint.save(content)
 
     @contextmanager
-    def saved_on_failure(self, pressed: list[int]) -> Iterator[None]:
+    def saved_on_failure(self, signals: list[int]) -> Iterator[None]:
         """Save the latest step if the block raises an exception, so that ``holotorch resume`` repeats no steps.
 
         A signal that follows the exception, as ``torchrun`` sends one when another process has ended, only goes into
-        the list ``pressed`` meanwhile.
+        the list ``signals`` meanwhile.
         """
         try:
             yield
         except Exception:
-            with deferred(pressed):
+            with deferred(signals):
                 if not (self.checkpoint.path.parent / "summary.json").is_file():
                     self.save()
             raise

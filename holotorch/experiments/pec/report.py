@@ -39,8 +39,8 @@ def pec_section(run: RunRecord) -> list[str]:
     parts = [heading(run.title, run.summary["status"])]
     parts.append(_table([{"method": METHOD_NAMES.get(name, name)} | _cells(each) for name, each in methods.items()]))
     parts.append(element("p", _verdict(run)))
-    if words := error_sentence(run.summary):
-        parts.append(element("p", words))
+    if sentence := error_sentence(run.summary):
+        parts.append(element("p", sentence))
     parts += [*_zone_table(methods), '<div class="row">']
     for name, caption in _PICTURES.items():
         if source := run.picture(name):

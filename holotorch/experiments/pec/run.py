@@ -34,16 +34,16 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
 
     Several processes share the solver and the baselines; only the first one fills the folder.
     """
-    settings, out, pressed = experiment.settings, opened.path, opened.pressed
+    settings, out, signals = experiment.settings, opened.path, opened.signals
     if process_count()[0] > 0:
         solution = experiment.solve(resume=from_first(None))
         if settings.solver.reruns:
             rerun(experiment, solution, 0.0)
-        _baselines(experiment, pressed)
+        _baselines(experiment, signals)
         return True
     (out / "arrays").mkdir(exist_ok=True)
     log, files = Log(experiment, Checkpoint(out / "checkpoint.pt", _fingerprint(experiment))), Results()
-    with log.saved_on_failure(pressed):
+    with log.saved_on_failure(signals):
         try:
             solution = experiment.solve(log, from_first(log.resume))
         except KeyboardInterrupt:
@@ -55,20 +55,20 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
         seconds = log.seconds
         attempts: dict[str, Any] = {}
         try:
-            if settings.solver.reruns and not pressed:
+            if settings.solver.reruns and not signals:
                 solution, seconds, attempts["dark_spots_of_attempts"] = rerun(experiment, solution, seconds)
         except KeyboardInterrupt:
-            pressed.append(signal.SIGINT)
-        with deferred(pressed):  # from here on Ctrl-C takes effect only after the results are saved
-            if pressed:
+            signals.append(signal.SIGINT)
+        with deferred(signals):  # from here on Ctrl-C takes effect only after the results are saved
+            if signals:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
             results["corrected"].numbers.update(attempts)
             files.write(save_array, out / "arrays" / "phase.npy", results["corrected"].phase.float())
-        results |= _baselines(experiment, pressed)
-        errors = None if pressed else measured_values(lambda: pec_errors(experiment, solution))
-        with deferred(pressed):
-            if pressed:
+        results |= _baselines(experiment, signals)
+        errors = None if signals else measured_values(lambda: pec_errors(experiment, solution))
+        with deferred(signals):
+            if signals:
                 log.save()
             _write_results(out, experiment, results, log, solution, files)
             summary = {
@@ -78,7 +78,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 **(errors or {}),
                 "peak_memory_bytes": peak_memory(),
             }
-            return conclude(opened, summary, files, done=errors is not None and not pressed, checkpoint=log.checkpoint)
+            return conclude(opened, summary, files, done=errors is not None and not signals, checkpoint=log.checkpoint)
 
 
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:
@@ -109,14 +109,14 @@ def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, si
     return result
 
 
-def _baselines(experiment: PECExperiment, pressed: list[int]) -> dict[str, Result]:
+def _baselines(experiment: PECExperiment, signals: list[int]) -> dict[str, Result]:
     """Results of the baselines by name. Each process computes some of them, and the first one receives all."""
     (rank, count), names = process_count(), experiment.settings.report.baselines
     results: dict[str, Result] = {}
     try:
         for index, name in enumerate(names):
             mine, unweighted = index % count == rank, name == "unweighted"
-            if pressed or not (mine or unweighted):  # all processes share the solver of the unweighted phases
+            if signals or not (mine or unweighted):  # all processes share the solver of the unweighted phases
                 continue
             try:
                 solve = experiment.unweighted.solve if unweighted else partial(baseline, experiment, name)
@@ -125,11 +125,11 @@ def _baselines(experiment: PECExperiment, pressed: list[int]) -> dict[str, Resul
                     results[name] = _result(experiment, solution, seconds, single=not unweighted)
             except ValueError as error:
                 print(f"{name} is left out: {error}", file=sys.stderr)
-        if not pressed:
+        if not signals:
             for others in collected(results):
                 results |= others
     except KeyboardInterrupt:
-        pressed.append(signal.SIGINT)
+        signals.append(signal.SIGINT)
     return {name: results[name] for name in names if name in results}
 
 

@@ -152,11 +152,11 @@ class Bench:
         """Gerchberg-Saxton; ``kind`` is "none", "basic" (crosstalk in the loop) or "ipec" (deconvolution as well)."""
         problem, propagator = self.experiment.problem(), self.experiment.propagator
         target, mask = problem.target, problem.mask
-        begin = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
+        start = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
         if kind == "ipec":
-            return iterative_pec(propagator, self.crosstalk, target, begin, max_steps=PASSES, mask=mask)
+            return iterative_pec(propagator, self.crosstalk, target, start, max_steps=PASSES, mask=mask)
         spread = self.crosstalk if kind == "basic" else None
-        return gerchberg_saxton(propagator, target, begin, max_steps=PASSES, crosstalk=spread, mask=mask)
+        return gerchberg_saxton(propagator, target, start, max_steps=PASSES, crosstalk=spread, mask=mask)
 
     def formed(self, phase: Tensor) -> Tensor:
         """Intensity of the picture, float64 [C, h, w], that the frames of ``phase`` ([F,] C, H, W) form on average."""
@@ -173,7 +173,7 @@ class Bench:
         formed = self.formed(phase) if formed is None else formed
         image, light = self.experiment.image, formed.sum((-2, -1)) / math.prod(self.shape)
         if self.experiment.scale_free:
-            formed = formed * best_scale(formed, self.experiment.wanted)[:, None, None]
+            formed = formed * best_scale(formed, self.experiment.normalised)[:, None, None]
         picture = (formed * image.mean((-2, -1), keepdim=True)).clamp(0, 1)
         single = ssim(picture, image, data_range=1.0).reshape(-1, self.channels).mean(1)  # of each photograph
         scores = {

@@ -137,9 +137,9 @@ def _verdict(compared: list[dict], amount: Amount) -> list[str]:
         parts = [f"{name} {each[0][0]}/{each[0][1]} .. {each[-1][0]}/{each[-1][1]}" for name, each in ratios.items()]
         lines.append(f"{kind}, sigma {sigma:g}: " + "; ".join(parts))
         if goal := goals["solver"].get(sigma):
-            wanted = goal["evaluations"], goal["seconds"]
-            met = [name for name, each in ratios.items() if all(a >= wanted[0] and b >= wanted[1] for a, b in each)]
-            lines[-1] += f" (goal {wanted[0]:g}/{wanted[1]:g}: {'met by ' + '; '.join(met) if met else 'not met'})"
+            limits = goal["evaluations"], goal["seconds"]
+            met = [name for name, each in ratios.items() if all(a >= limits[0] and b >= limits[1] for a, b in each)]
+            lines[-1] += f" (goal {limits[0]:g}/{limits[1]:g}: {'met by ' + '; '.join(met) if met else 'not met'})"
     return lines + _tables(goals.get("thesis", {}), "reproduced") + _tables(goals.get("goals", {}), "met")
 
 
@@ -162,7 +162,7 @@ def _tables(statements: dict[str, list[dict[str, Any]]], word: str) -> list[str]
         judged = [(_judged(_statistic(rows, statement), statement, word), statement) for statement in about]
         counts = Counter(verdict for (verdict, _), _ in judged)
         lines.append(f"{name}: " + ", ".join(f"{counts[each]} {each}" for each in counts) + f" of {len(about)}")
-        lines += [f"  {verdict}: {each['says']} ({found})" for (verdict, found), each in judged if verdict != "met"]
+        lines += [f"  {verdict}: {goal['says']} ({value})" for (verdict, value), goal in judged if verdict != "met"]
     return lines
 
 
@@ -195,7 +195,7 @@ def _statistic(rows: list[dict[str, str]], statement: dict[str, Any]) -> float:
         return math.nan
     if statement.get("statistic") == "onset":
         least = (1 - statement["fall"]) * values[0]
-        sigmas = [float(each) for each in statement["rows"]["sigma_px"]]
+        sigmas = [float(sigma) for sigma in statement["rows"]["sigma_px"]]
         return next((sigma for sigma, value in zip(sigmas, values, strict=True) if value < least), math.inf)
     if statement.get("statistic") == "range":
         return max(values) - min(values)

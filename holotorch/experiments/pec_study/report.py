@@ -11,9 +11,9 @@ def study_section(record: RunRecord) -> list[str]:
     summary = record.summary
     parts = [heading(f"{record.title}: {summary['study']}", summary["status"])]
     if source := record.picture("table"):
-        words = "Each line is a method, each point "
-        words += "a median of rounds" if summary["study"] == "time" else "the mean over the photographs"
-        parts.append(figure(source, words, "wide"))
+        caption = "Each line is a method, each point "
+        caption += "a median of rounds" if summary["study"] == "time" else "the mean over the photographs"
+        parts.append(figure(source, caption, "wide"))
         parts.append(element("p", f"{METHODS}. Sigma: {SIGMA_MEANING}."))
     if text := record.text("table.txt"):
         parts.append(element("pre", text))

@@ -99,7 +99,7 @@ def scaling(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> 
         setup = replace(bench, size=size, sigma_px=sigma)
         rounds = [list(_methods(setup, steps, setting=f"{size} px")) for _ in range(ROUNDS)]
         for row, *others in zip(*rounds, strict=True):
-            seconds = sorted(each["seconds"] for each in (row, *others))
+            seconds = sorted(repeat["seconds"] for repeat in (row, *others))
             spread = round(seconds[-1] / max(seconds[0], 1e-3), 2)
             yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
 
@@ -109,7 +109,7 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> It
     for sigma in cases.each(sigmas, desc="depths", unit="sigma"):
         setup = replace(bench, kind="fresnel", distances=DEPTHS, sigma_px=sigma)
         yield _slices(setup, steps)
-        wanted = setup.experiment.wanted
+        normalised = setup.experiment.normalised
         for name, frames in (("one hologram", 1), ("4 joint frames", 4)):
             solution, seconds = timed(partial(setup.lbfgs, setup.start("cool", frames), steps=steps))
             yield _row(setup, name, setup.scores(solution.x), seconds)
@@ -117,7 +117,7 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> It
                 image = replace(setup, distances=(plane,)).formed(solution.x)
                 for band, depth in enumerate(DEPTHS):
                     part = slice(band * setup.size // 3, (band + 1) * setup.size // 3)
-                    error = (image - wanted)[..., part].square().mean().sqrt() / wanted[..., part].std()
+                    error = (image - normalised)[..., part].square().mean().sqrt() / normalised[..., part].std()
                     setting = f"focus {plane * 1e3:g} mm, band of {depth * 1e3:g} mm"
                     yield _row(setup, name, {"error": error.item()}, setting=setting)
         for plane, depth, error in focal_sweep(replace(bench, sigma_px=sigma), min(steps, 100)):
@@ -129,13 +129,13 @@ def starts(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> I
     """Thesis Sec. 4.4.5.2: ``error`` is the share of ``count`` results with speckle noise, before and after a rerun."""
     settings = [(kind, start) for kind in ("fourier", "fresnel") for start in ("hot", "cool", "flat")]
     for (kind, start), sigma in cases.each(
-        [(each, s) for s in sigmas for each in settings], desc="starts", unit="case"
+        [(setting, s) for s in sigmas for setting in settings], desc="starts", unit="case"
     ):
         setup, noisy, scores = replace(bench, kind=kind, sigma_px=sigma), [], []
         for seed in range(2 * DRAWS):
             phase = setup.algorithm2(setup.start(start, seed=seed), steps=steps).x
             formed = setup.formed(phase)
-            noisy.append(dark_spots(formed / formed.mean((-2, -1), keepdim=True), setup.experiment.wanted) > 0)
+            noisy.append(dark_spots(formed / formed.mean((-2, -1), keepdim=True), setup.experiment.normalised) > 0)
             scores.append(setup.scores(phase, formed)["ssim"])
         before, after = torch.stack(noisy[:DRAWS]), torch.stack(noisy).unflatten(0, (2, DRAWS)).all(0)
         for name, share in (("", before), (", one rerun", after)):
@@ -225,15 +225,15 @@ def _methods(bench: Bench, steps: int, names: Sequence[str] = _CORRECTED, settin
 
 def _slices(bench: Bench, steps: int) -> Row:
     """Row of the thesis's method: one hologram for the slice of the picture at each depth, shown in turn."""
-    started, mask, wanted = time.perf_counter(), bench.experiment.mask, bench.experiment.wanted
+    started, mask, normalised = time.perf_counter(), bench.experiment.mask, bench.experiment.normalised
     assert mask is not None
     phases, formed = [], torch.zeros((), dtype=torch.float64)
     for i, distance in enumerate(bench.distances):
-        part = wanted * mask[0, i]
+        part = normalised * mask[0, i]
         single = replace(bench, distances=(distance,), pictures=part)
         phases.append(single.algorithm2(single.start("cool", seed=i), steps=steps).x)
         formed = formed + bench.formed(phases[-1]) * part.mean((-2, -1), keepdim=True)
-    scores = bench.scores(phases[0], formed * (wanted.mean() / formed.mean()))
+    scores = bench.scores(phases[0], formed * (normalised.mean() / formed.mean()))
     return _row(bench, f"stack of {len(phases)} slices", scores, time.perf_counter() - started)
 
 

@@ -25,15 +25,15 @@ def times_picture(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         for k, method in enumerate(dict.fromkeys(row["method"] for row in chosen)):
             curve = {position(row): row for row in chosen if row["method"] == method}  # the last of equal cases
             x = sorted(curve)
-            seconds = [curve[each]["seconds"] for each in x]
-            half = [curve[each]["seconds_spread"] ** 0.5 for each in x]
+            seconds = [curve[key]["seconds"] for key in x]
+            half = [curve[key]["seconds_spread"] ** 0.5 for key in x]
             bars = [[s - s / h for s, h in zip(seconds, half, strict=True)]]
             bars.append([s * h - s for s, h in zip(seconds, half, strict=True)])
             axes.errorbar(x, seconds, bars, fmt="os^v"[k % 4] + "-", label=method, markersize=5, capsize=3)
         axes.set(xlabel=label, ylabel="seconds", yscale="log")
         if i:
             axes.set_xscale("log", base=2)
-            axes.set_xticks(x := sorted({position(row) for row in chosen}), [str(each) for each in x])
+            axes.set_xticks(x := sorted({position(row) for row in chosen}), [str(value) for value in x])
         axes.set_title(f"{title}, {base}" if i == 0 else f"sigma {sigma:g} px", fontsize=9)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)

@@ -45,14 +45,14 @@ def focal_sweep(bench: Bench, steps: int) -> list[tuple[float, float, float]]:
         phase = single.algorithm2(single.start("cool"), steps=steps).x
         for k, focus in enumerate(foci):
             shown[k] += image.mean() * replace(single, distances=(focus,)).formed(phase)[0]
-    wanted = light.sum(0).double()
+    reference = light.sum(0).double()
     part = (depth_map - torch.tensor(foci)[:, None, None]).abs().argmin(0)
-    lit = wanted > _LIT * wanted.max()
+    lit = reference > _LIT * reference.max()
     errors = []
     for k, focus in enumerate(foci):
         for j, depth in enumerate(foci):
             inside = (part == j) & lit
             if inside.any():
-                error = (shown[k] - wanted)[inside].square().sum() / wanted[inside].square().sum()
+                error = (shown[k] - reference)[inside].square().sum() / reference[inside].square().sum()
                 errors.append((focus, depth, math.sqrt(error.item())))
     return errors

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-LIMIT = 30.0  # longest time of a measurement, in seconds on the reference machine of ``machine``
+# Longest time of a measurement, in seconds on the reference machine of ``machine``: every machine measures the same.
+LIMIT = 30.0
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,11 @@ def not_measured(part: str, predicted: float, seconds: float) -> Comparison:
 
 def error_values(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """Entries of summary.json; the errors of the measured parts are added in squares."""
-    measured = [each for each in comparisons if each.measured is not None]
+    measured = [comparison for comparison in comparisons if comparison.measured is not None]
     return {
-        "predicted_error": math.hypot(*(each.predicted for each in measured or comparisons)),
-        "measured_error": math.hypot(*(each.measured or 0.0 for each in measured)) if measured else None,
-        "errors": [vars(each) for each in comparisons],
+        "predicted_error": math.hypot(*(comparison.predicted for comparison in measured or comparisons)),
+        "measured_error": math.hypot(*(comparison.measured or 0.0 for comparison in measured)) if measured else None,
+        "errors": [vars(comparison) for comparison in comparisons],
     }
 
 
@@ -61,7 +62,7 @@ def measured_values(measure: Callable[[], Sequence[Comparison]]) -> dict[str, An
 def error_sentence(summary: dict[str, Any]) -> str:
     """The line of a report about the errors in a summary; empty for a summary without any."""
     parts = []
-    for each in summary.get("errors", ()):
-        measured = "" if each["measured"] is None else f"{each['measured']:.1e} measured: "
-        parts.append(f"{each['part']} {each['predicted']:.1e} predicted, {measured}{each['note']}")
+    for error in summary.get("errors", ()):
+        measured = "" if error["measured"] is None else f"{error['measured']:.1e} measured: "
+        parts.append(f"{error['part']} {error['predicted']:.1e} predicted, {measured}{error['note']}")
     return f"Relative L2 error. {'; '.join(parts)}." if parts else ""

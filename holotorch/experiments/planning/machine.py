@@ -69,17 +69,17 @@ class Machine:
         return self.interpreter * (_START + _FIGURE * figures)
 
     def score(self, values: int, *, double: bool) -> float:
-        """Seconds to compare pictures of ``values`` in total with those wanted, by SSIM and PSNR."""
+        """Seconds to compare pictures of ``values`` in total with their targets, by SSIM and PSNR."""
         return (2 if double else 1) * values * _SCORE[values > _CACHED] * self.elementwise
 
     def __str__(self) -> str:
-        words = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in asdict(self).items())
-        return f"times relative to the reference machine: {words}"
+        speeds = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in asdict(self).items())
+        return f"times relative to the reference machine: {speeds}"
 
 
 def seconds_in_words(seconds: dict[str, float]) -> str:
     """Parts of predicted seconds for the line of a plan."""
-    return ", ".join(f"{each:.2g} s {name}" for name, each in seconds.items())
+    return ", ".join(f"{value:.2g} s {name}" for name, value in seconds.items())
 
 
 _known: dict[str, Machine] = {}  # by name of the file
@@ -155,8 +155,8 @@ def _measure(device: torch.device) -> Machine:
 
 def _fastest(call: Callable[[], object], device: torch.device) -> float:
     call()  # the first call allocates memory and plans the transform
-    begin, times = time.perf_counter(), []
-    while len(times) < _ROUNDS or (times and time.perf_counter() - begin < _SECONDS):
+    start, times = time.perf_counter(), []
+    while len(times) < _ROUNDS or (times and time.perf_counter() - start < _SECONDS):
         started = time.perf_counter()
         call()
         if device.type == "cuda":

@@ -97,12 +97,12 @@ class Budget:
     @property
     def text(self) -> str:
         """The tolerance in words, one line of a plan."""
-        words = []
+        parts = []
         for name, part in self.parts.items():
             source = {"share": "", "default": " by default"}.get(self._source(name), f" by {part.key}")
-            words.append(f"{self.share(name):.1e} {name}{source} (predicted {self.error(name):.1e})")
+            parts.append(f"{self.share(name):.1e} {name}{source} (predicted {self.error(name):.1e})")
         whole = "" if self.tolerance is None else f"{self.tolerance:.1e} = "
         exceeded = ""
         if self.tolerance is not None and self.predicted_error > 1.001 * self.tolerance:
             exceeded = f"; the prediction of all parts, {self.predicted_error:.1e}, exceeds it"
-        return f"Tolerance  {whole}{' + '.join(words)}; errors add in squares{exceeded}"
+        return f"Tolerance  {whole}{' + '.join(parts)}; errors add in squares{exceeded}"

@@ -108,8 +108,8 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
             axes.semilogy(steps[stage:], relative[stage:, i], **style)
     if stage:
         axes.axvline(stage - 0.5, color="0.4", linewidth=1, linestyle=":")
-        words = "the error of the amplitude; from there on that of the intensity, and what a limit adds"
-        axes.set_title(f"The loss up to step {stage - 1} (dotted) is {words}", fontsize=8)
+        label = "the error of the amplitude; from there on that of the intensity, and what a limit adds"
+        axes.set_title(f"The loss up to step {stage - 1} (dotted) is {label}", fontsize=8)
     axes.set(xlabel="step", ylabel="loss / loss at the start")
     axes.grid(alpha=0.3)
     if checked:
@@ -150,8 +150,8 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
             x = [positions.index((row["setting"], row["sigma_px"])) for row in curve]
             axes.plot(x, [row["ssim"] for row in curve], "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
         step = max(1, len(positions) // 12)
-        words = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
-        axes.set_xticks(range(0, len(positions), step), words[::step], fontsize=7, rotation=30 if step > 1 else 0)
+        labels = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
+        axes.set_xticks(range(0, len(positions), step), labels[::step], fontsize=7, rotation=30 if step > 1 else 0)
         axes.set(ylim=(0, 1.02), ylabel="mean SSIM")
         axes.set_title(f"{title}, {kind}", fontsize=9)
         axes.grid(alpha=0.3)

@@ -36,7 +36,7 @@ def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
     """A description of each key in which two fingerprints differ."""
     lines = []
     for key in sorted({*before, *now}):
-        old, new = (each.get(key, "nothing") for each in (before, now))
+        old, new = (values.get(key, "nothing") for values in (before, now))
         if old != new:
             is_file = str(old).startswith(_PREFIX)
             lines.append(f"{key} has other contents" if is_file else f"{key} was {_short(old)} and is {_short(new)}")

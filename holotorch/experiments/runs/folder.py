@@ -21,7 +21,7 @@ from holotorch.experiments.runs.environment import environment
 from holotorch.experiments.runs.fingerprint import differences, fingerprint
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.saving import Checkpoint, Results
-from holotorch.experiments.runs.signals import Pressed, deferred, interruptible
+from holotorch.experiments.runs.signals import Signals, deferred, interruptible
 from holotorch.io.files import write_json, write_text
 
 _HALF_WRITTEN = re.compile(r"\.(env\.json|config\.yaml)\.\d+\.partial")  # temporary names of the first files of a run
@@ -62,7 +62,7 @@ class RunFolder:
     path: Path
     name: str
     plan: RunPlan
-    pressed: Pressed  # signals that have been received
+    signals: Signals  # signals that have been received
     resumes: bool = True  # whether the run can be continued after an interruption
     write_page: Callable[[Path], Any] | None = None  # writes the report to a path; None if there is no report
 
@@ -79,7 +79,7 @@ def open_run(
     results; a new folder without results is removed, so that a corrected run can use it. ConfigError if the folder is
     in use, holds other files, or cannot be written.
     """
-    with interruptible() as pressed, ExitStack() as stack:
+    with interruptible() as signals, ExitStack() as stack:
         if out is not None:
             with suppress(OSError):  # ``claim`` reports the error
                 out.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ def open_run(
             if new:
                 text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
                 write_text(folder / "config.yaml", FIRST_LINE + text)
-            yield RunFolder(folder, name, plan, pressed, resumes)
+            yield RunFolder(folder, name, plan, signals, resumes)
 
 
 def _unfinished(folder: Path, settings: BaseModel) -> bool:
@@ -201,7 +201,7 @@ def conclude(
     ``summary``. An error in writing a file, or the checkpoint if the run is not done, is raised as OSError after all
     other files are written.
     """
-    with deferred(run.pressed):
+    with deferred(run.signals):
         if not done and checkpoint is not None:
             results.failure = results.failure or checkpoint.failure
         complete = done and results.failure is None
@@ -211,7 +211,7 @@ def conclude(
         name = "summary.json" if complete else "interrupted.json"
         if results.write(write_json, run.path / name, summary):
             if complete:
-                run.pressed.settled = True
+                run.signals.settled = True
                 for path in (run.path / "checkpoint.pt", run.path / "interrupted.json"):
                     path.unlink(missing_ok=True)
             if run.write_page is not None:  # written last, since it shows the other files

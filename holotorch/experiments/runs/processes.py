@@ -124,7 +124,7 @@ class SharedIntensity(nn.Module):
             raise ConnectionError("the fields of the processes differ; start the run on processors of one type")
         return _Shared.apply(field, self)
 
-    def own(self, values: Tensor) -> Tensor:
+    def local(self, values: Tensor) -> Tensor:
         """The part [f, c, ...] of values [F, C, ...] that this process computes."""
         return values[self.frames.start : self.frames.stop, self.colours.start : self.colours.stop]
 
@@ -135,17 +135,17 @@ class _Shared(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, field: Tensor, shared: SharedIntensity) -> Tensor:
         with torch.enable_grad():
-            own = shared.own(field.reshape(-1, *field.shape[-3:])).detach().requires_grad_(ctx.needs_input_grad[0])
-            image = intensity(shared.propagator(own))
-        ctx.shared, ctx.part, ctx.image, ctx.shape = shared, own, image, field.shape
+            part = shared.local(field.reshape(-1, *field.shape[-3:])).detach().requires_grad_(ctx.needs_input_grad[0])
+            image = intensity(shared.propagator(part))
+        ctx.shared, ctx.part, ctx.image, ctx.shape = shared, part, image, field.shape
         whole = image.new_zeros(math.prod(field.shape[:-3]), field.shape[-3], *image.shape[2:])
-        shared.own(whole).copy_(image.detach())
+        shared.local(whole).copy_(image.detach())
         return added(whole).reshape(*field.shape[:-2], *image.shape[2:])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
         shared, image = ctx.shared, ctx.image
-        own = shared.own(gradient.reshape(-1, ctx.shape[-3], *image.shape[2:]))
+        part = shared.local(gradient.reshape(-1, ctx.shape[-3], *image.shape[2:]))
         whole = ctx.part.new_zeros(math.prod(ctx.shape[:-3]), *ctx.shape[-3:])
-        shared.own(whole).copy_(torch.autograd.grad(image, ctx.part, own)[0])
+        shared.local(whole).copy_(torch.autograd.grad(image, ctx.part, part)[0])
         return added(whole).reshape(ctx.shape), None

@@ -105,24 +105,24 @@ class Results(_Writer):
             return False
 
 
-def checksum(content: Any, most: float = math.inf) -> str:
+def checksum(content: Any, max_bytes: float = math.inf) -> str:
     """Checksum of nested tensors and plain values, since torch does not detect damaged numbers when it loads a file.
 
-    ValueError for values of other types, and for a tensor of more than ``most`` bytes.
+    ValueError for values of other types, and for a tensor of more than ``max_bytes`` bytes.
     """
     total = hashlib.blake2b(digest_size=16)
 
     def add(value: Any) -> None:
         if isinstance(value, Tensor):
-            if value.layout != torch.strided or value.nbytes > most:
+            if value.layout != torch.strided or value.nbytes > max_bytes:
                 raise ValueError(f"a tensor {list(value.shape)} that no run has saved")
             total.update(f"{tuple(value.shape)} {value.dtype}".encode())
             flat = value.detach().cpu().contiguous().reshape(-1)
             total.update(flat.view(torch.uint8).numpy().data if len(flat) else b"")
         elif isinstance(value, dict | list | tuple):
             total.update(f"{'{' if isinstance(value, dict) else '['}{len(value)}".encode())
-            for each in value.items() if isinstance(value, dict) else value:
-                add(each)
+            for item in value.items() if isinstance(value, dict) else value:
+                add(item)
         elif value is None or isinstance(value, str | int | float):
             total.update(f"{value!r};".encode())
         else:

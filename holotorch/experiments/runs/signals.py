@@ -7,17 +7,17 @@ from contextlib import contextmanager
 from typing import Any
 
 
-class Pressed(list[int]):
+class Signals(list[int]):
     """Numbers of the signals received. Once all results are on the disk (``settled``), signals are only recorded."""
 
     settled = False
 
 
-_current: Pressed | None = None  # the list of the outermost open block of the main thread
+_current: Signals | None = None  # the list of the outermost open block of the main thread
 
 
 @contextmanager
-def interruptible() -> Iterator[Pressed]:
+def interruptible() -> Iterator[Signals]:
     """Treat SIGTERM and SIGHUP (a closed terminal) like Ctrl-C within this block, and record the signals in a list.
 
     Only the first signal raises KeyboardInterrupt, and only before the list is ``settled``; a second signal does not
@@ -26,30 +26,30 @@ def interruptible() -> Iterator[Pressed]:
     """
     global _current
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
-        yield Pressed()
+        yield Signals()
         return
-    outer, pressed = _current, Pressed() if _current is None else _current
-    pressed.settled = False
-    if pressed:
+    outer, signals = _current, Signals() if _current is None else _current
+    signals.settled = False
+    if signals:
         raise KeyboardInterrupt
 
     def note(number: int, _: Any) -> None:
-        pressed.append(number)
-        if len(pressed) == 1 and not pressed.settled:
+        signals.append(number)
+        if len(signals) == 1 and not signals.settled:
             raise KeyboardInterrupt
 
-    _current = pressed
+    _current = signals
     try:
         with handling(note):
-            yield pressed
+            yield signals
     finally:
         _current = outer
 
 
 @contextmanager
-def deferred(pressed: list[int]) -> Iterator[None]:
+def deferred(signals: list[int]) -> Iterator[None]:
     """Record signals within this block without raising KeyboardInterrupt."""
-    with handling(lambda number, _: pressed.append(number)):
+    with handling(lambda number, _: signals.append(number)):
         yield
 
 

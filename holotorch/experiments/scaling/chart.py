@@ -48,34 +48,34 @@ def scaling(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dic
     """Rows of the measurement, of the model and of its assumptions, the picture, and the verdict."""
     amount, cluster, before = QUICK if quick else FULL, Cluster(), load()
     measured, link = measure(amount.cases, amount.repetitions)
-    rows = [row for each in measured for row in _rows(each, link)]
+    rows = [row for task in measured for row in _rows(task, link)]
     model = _model(cluster, amount.counts)
     verdict = _verdict(measured, link, model, (before, load()))
     return rows, {"model": model, "assumptions": cluster.table()}, {"chart": _draw(measured, link, model)}, verdict
 
 
-def predicted(each: Measured, link: Link, count: int) -> float:
+def predicted(task: Measured, link: Link, count: int) -> float:
     """Seconds of a measured task on ``count`` processes of an idle machine, predicted from one process and the link."""
-    return sum(each.work.seconds(count, link).values())
+    return sum(task.work.seconds(count, link).values())
 
 
-def _rows(each: Measured, link: Link) -> list[dict[str, Any]]:
+def _rows(task: Measured, link: Link) -> list[dict[str, Any]]:
     rows = []
-    for count, times, worked in ((1, each.alone, each.working[0]), (COUNT, each.together, each.working[1])):
+    for count, times, worked in ((1, task.alone, task.working[0]), (COUNT, task.together, task.working[1])):
         rows.append(
             {
-                "task": each.work.name,
+                "task": task.work.name,
                 "processes": count,
-                "largest_share": each.work.largest(count) / each.work.units,
+                "largest_share": task.work.largest(count) / task.work.units,
                 "seconds": f"{statistics.median(times):.4g}",
                 "fastest": f"{min(times):.4g}",
                 "slowest": f"{max(times):.4g}",
-                "speedup": f"{each.speedup if count > 1 else 1:.3f}",
+                "speedup": f"{task.speedup if count > 1 else 1:.3f}",
                 "processor_seconds": f"{worked:.4g}",
-                "processor_speedup": f"{each.working[0] / worked:.3f}",
-                "model_seconds": f"{predicted(each, link, count):.4g}",
-                "model_speedup": f"{predicted(each, link, 1) / predicted(each, link, count):.3f}",
-                "difference": f"{each.error if count > 1 else 0:.1e}",
+                "processor_speedup": f"{task.working[0] / worked:.3f}",
+                "model_seconds": f"{predicted(task, link, count):.4g}",
+                "model_speedup": f"{predicted(task, link, 1) / predicted(task, link, count):.3f}",
+                "difference": f"{task.error if count > 1 else 0:.1e}",
             }
         )
     return rows
@@ -101,36 +101,36 @@ def _verdict(
         f"torch {torch.__version__}, one thread in each process; one and two processes in alternation, medians; load "
         f"of the machine {loads[0]:.1f} before and {loads[1]:.1f} after"
     ]
-    for each in measured:
-        ratios = sorted(one / two for one, two in zip(each.alone, each.together, strict=True))
-        here = predicted(each, link, 1) / predicted(each, link, COUNT)
+    for task in measured:
+        ratios = sorted(one / two for one, two in zip(task.alone, task.together, strict=True))
+        here = predicted(task, link, 1) / predicted(task, link, COUNT)
         lines.append(
-            f"{each.work.name}: two processes {each.speedup:.2f} times as fast as one ({ratios[0]:.2f} to "
-            f"{ratios[-1]:.2f} in {len(ratios)} repetitions), {each.working[0] / each.working[1]:.2f} by the time that "
-            f"the processors worked, model {here:.2f}; results differ by {each.error:.1e}"
+            f"{task.work.name}: two processes {task.speedup:.2f} times as fast as one ({ratios[0]:.2f} to "
+            f"{ratios[-1]:.2f} in {len(ratios)} repetitions), {task.working[0] / task.working[1]:.2f} by the time that "
+            f"the processors worked, model {here:.2f}; results differ by {task.error:.1e}"
         )
     lines.append(f"sums over both processes: {link.bandwidth / 1e9:.2f} GB/s, latency {1e6 * link.latency:.0f} us")
     for name in dict.fromkeys(row["task"] for row in model):
         own = [row for row in model if row["task"] == name]
         best = max(own, key=lambda row: float(row["speedup"]))
-        words = ", ".join(f"{row['speedup']} on {row['gpus']}" for row in own)
-        lines.append(f"{MODEL}: {name}: {words}; fastest on {best['gpus']} GPUs")
+        speedups = ", ".join(f"{row['speedup']} on {row['gpus']}" for row in own)
+        lines.append(f"{MODEL}: {name}: {speedups}; fastest on {best['gpus']} GPUs")
     return lines
 
 
 def _draw(measured: list[Measured], link: Link, model: list[dict[str, Any]]) -> bytes:
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for index, each in enumerate(measured):
-        ratios = [one / two for one, two in zip(each.alone, each.together, strict=True)]
+    for index, task in enumerate(measured):
+        ratios = [one / two for one, two in zip(task.alone, task.together, strict=True)]
         left.plot([index] * len(ratios), ratios, ".", color="0.7", label=None if index else "repetitions")
-        left.plot(index, each.speedup, "o", color="C0", label=None if index else "measured, median")
-        ratio = predicted(each, link, 1) / predicted(each, link, COUNT)
-        worked = each.working[0] / each.working[1]
+        left.plot(index, task.speedup, "o", color="C0", label=None if index else "measured, median")
+        ratio = predicted(task, link, 1) / predicted(task, link, COUNT)
+        worked = task.working[0] / task.working[1]
         left.plot(index, worked, "s", color="C2", label=None if index else "by the time that the processors worked")
         left.plot(index, ratio, "_", color="C3", markersize=24, label=None if index else "model")
     left.axhline(COUNT, color="k", linestyle=":", linewidth=1)
-    left.set_xticks(range(len(measured)), [each.work.name for each in measured], fontsize=8)
+    left.set_xticks(range(len(measured)), [task.work.name for task in measured], fontsize=8)
     left.set_xlim(-0.5, len(measured) - 0.5)
     left.set_ylim(0, 1.3 * COUNT)
     left.set_ylabel("speed of two processes over that of one")

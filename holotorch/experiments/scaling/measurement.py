@@ -131,7 +131,7 @@ def _case(case: Case, repetitions: int) -> dict[str, Any]:
         "alone": times["alone"],
         "together": times["together"],
         "divided": statistics.median(times["divided"]),
-        "working": [statistics.median(each) for each in working],
+        "working": [statistics.median(seconds) for seconds in working],
         "error": ((one - two).norm() / one.norm()).item(),
     }
 
@@ -151,7 +151,7 @@ def _volume(experiment: VolumeExperiment, rounds: int) -> _Task:
     def run(shared: bool) -> Tensor:
         part = Part(rank, count, planes, colours) if shared else None
         fields = [experiment.hologram(seed, part=part)[0] for seed in range(rounds)]
-        return torch.stack([added(each) if shared else each for each in fields])
+        return torch.stack([added(field) if shared else field for field in fields])
 
     with torch.no_grad():
         layers = experiment.layers()

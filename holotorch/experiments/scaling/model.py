@@ -33,7 +33,7 @@ class Cluster:
 
     def table(self) -> list[dict[str, Any]]:
         """The assumptions as rows of a table."""
-        return [{"name": each.name, "value": getattr(self, each.name), **each.metadata} for each in fields(self)]
+        return [{"name": field.name, "value": getattr(self, field.name), **field.metadata} for field in fields(self)]
 
 
 @dataclass(frozen=True)

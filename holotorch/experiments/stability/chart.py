@@ -29,7 +29,7 @@ def stability(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], d
     """
     sweeps = all_sweeps()
     if quick:
-        sweeps = [replace(each, values=each.values[:: max(1, (len(each.values) - 1) // 2)]) for each in sweeps]
+        sweeps = [replace(sweep, values=sweep.values[:: max(1, (len(sweep.values) - 1) // 2)]) for sweep in sweeps]
     points = [point for sweep in tqdm(sweeps, desc="stability", unit="sweep") for point in sweep.points()]
     rows, pictures = [row(point) for point in points], {"chart": draw(points)}
     return rows, {}, pictures, verdict(points)
@@ -56,13 +56,13 @@ def verdict(points: list[Point]) -> list[str]:
     counts, sweeps = Counter(point.said for point in points), {(p.method, p.swept) for p in points}
     silent = [point for point in points if not point.ok]
     sources = Counter(point.tolerance_from for point in points)
-    said = ", ".join(f"{counts[each]} {each}" for each in ("nothing", "switched", "warned", "refused"))
+    said = ", ".join(f"{counts[outcome]} {outcome}" for outcome in ("nothing", "switched", "warned", "refused"))
     lines = [
         f"torch {torch.__version__}; {len(points)} points of {len(sweeps)} sweeps; said: {said}",
         "tolerances: " + ", ".join(f"{count} {source}" for source, count in sources.items()),
         f"silent failures (an error above {SILENT} tolerances without a word): {len(silent)}",
     ]
-    lines += [f"silent: {each.label}: error {each.measured:.1e} for {each.tolerance:.1e}" for each in silent]
+    lines += [f"silent: {point.label}: error {point.measured:.1e} for {point.tolerance:.1e}" for point in silent]
     ratios = [p.predicted / p.measured for p in points if _both(p)]
     if len(ratios) > 1:
         low, middle, high = (statistics.quantiles(ratios, n=20)[i] for i in (0, 9, 18))

@@ -14,7 +14,7 @@ from holotorch.experiments.stability.sweep import ASKED, Answer, Sweep
 from holotorch.optics import Display, Eye, Retina, SpectralRetina, Spectrum
 from holotorch.optics.free_space.cropped import CroppedKernel
 from holotorch.optics.light.coherence import path_difference
-from holotorch.optics.light.wavelength_sampling import least_followed, neighbour_error, seen_light
+from holotorch.optics.light.wavelength_sampling import least_count, neighbour_error, pupil_illumination
 
 CENTRE = 520e-9  # metres
 SMALL, GRID = Grid((20, 17), 8e-6), Grid((40, 32), 8e-6)  # of a hologram alone, and of one behind an eyepiece
@@ -36,9 +36,9 @@ def sweeps() -> list[Sweep]:
               lambda z: _many(z, 10e-9), TOLERANCE, ASKED),
         Sweep("Spectrum.samples", "tolerance", tolerances, lambda t: _few(10e-3, t, 10e-9),
               lambda _: _many(10e-3, 10e-9), tolerance_from=ASKED),
-        Sweep("SpectralRetina", "width (m)", widths, partial(_followed, TOLERANCE),
+        Sweep("SpectralRetina", "width (m)", widths, partial(_propagated, TOLERANCE),
               partial(_each, TOLERANCE), TOLERANCE, ASKED),
-        Sweep("SpectralRetina", "tolerance", tolerances, lambda t: _followed(t, 20e-9), lambda t: _each(t, 20e-9),
+        Sweep("SpectralRetina", "tolerance", tolerances, lambda t: _propagated(t, 20e-9), lambda t: _each(t, 20e-9),
               tolerance_from=ASKED),
     ]  # fmt: skip
 
@@ -70,33 +70,29 @@ def _light(fwhm: float) -> tuple[Tensor, Tensor]:
     return Spectrum.lorentzian(CENTRE, fwhm).samples(EVERY)
 
 
-def _inside() -> Tensor:
-    """Noise [1, H, W] within the middle half of the window, whose light stays in it for all wavelengths."""
-    y, x = GRID.coordinates()
-    inside = (y.abs() < GRID.extent[0] / 4) & (x.abs() < GRID.extent[1] / 4)
-    return (reference.noise(GRID.shape) * inside)[None]
-
-
-def _followed(tolerance: float, fwhm: float) -> Answer:
+def _propagated(tolerance: float, fwhm: float) -> Answer:
     """The image [1, H, W] with as many wavelengths propagated as the tolerance requires.
 
     The error of the propagation of each wavelength is left to ``Retina`` and is the same in the reference.
     """
     wavelengths, weights = _light(fwhm)
-    count = least_followed(wavelengths, weights, tolerance, GRID, *OPTICS)
-    light = seen_light(GRID, wavelengths.mean().item(), *OPTICS)
+    count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
+    light = pupil_illumination(GRID, wavelengths.mean().item(), *OPTICS)
     predicted = neighbour_error(wavelengths, weights, count, light)
     retina = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE)
-    return Answer(retina(_inside()), predicted, f"{count} of {EVERY} wavelengths", tolerance)
+    return Answer(retina(reference.noise_inside(GRID)), predicted, f"{count} of {EVERY} wavelengths", tolerance)
 
 
 def _each(tolerance: float, fwhm: float) -> Tensor:
     """The same image with every wavelength propagated, in the same window, so that the pupil has the same samples."""
     wavelengths, weights = _light(fwhm)
-    count = least_followed(wavelengths, weights, tolerance, GRID, *OPTICS)
+    count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
     wide = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE).wide[0]
     y, x = ((big - small) // 2 for big, small in zip(wide.shape, GRID.shape, strict=True))
-    field, total = functional.pad(_inside(), (x, x, y, y)), torch.zeros(1, *wide.shape, dtype=torch.float64)
+    field, total = (
+        functional.pad(reference.noise_inside(GRID), (x, x, y, y)),
+        torch.zeros(1, *wide.shape, dtype=torch.float64),
+    )
     for wavelength, weight in zip(wavelengths.tolist(), weights.tolist(), strict=True):
         total += weight * Retina(wide, wavelength, *OPTICS, tolerance=LOOSE)(field)
     return total[..., y : y + GRID.shape[0], x : x + GRID.shape[1]]

@@ -57,9 +57,9 @@ def _draw_sweep(axes, points: list[Point]) -> None:
 def _positions(axes, points: list[Point]) -> list[float]:
     """Places of the points along x; numbers on a logarithmic axis if they span decades, words in their order."""
     if any(isinstance(point.value, str) for point in points):
-        words = [str(point.value) for point in points]
-        few = len(words) <= _COLUMNS  # more words do not fit; the table has them
-        axes.set_xticks(range(len(words)), words if few else range(1, len(words) + 1))
+        labels = [str(point.value) for point in points]
+        few = len(labels) <= _COLUMNS  # more words do not fit; the table has them
+        axes.set_xticks(range(len(labels)), labels if few else range(1, len(labels) + 1))
         return [float(i) for i in range(len(points))]
     values = [float(point.value) for point in points]
     sizes = sorted(abs(value) for value in values if value)

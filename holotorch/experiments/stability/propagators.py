@@ -98,11 +98,11 @@ def _far_field() -> Sweep:
     The class knows no distance and cannot warn, so that what it documents is the tolerance however large.
     """
     grid = Grid((8, 8), 8e-6)
-    far, field = Fraunhofer(grid, WAVELENGTH), reference.noise(grid.shape)
+    operator, field = Fraunhofer(grid, WAVELENGTH), reference.noise(grid.shape)
 
     def answer(distance: float) -> Answer:
         error = math.pi / (4 * WAVELENGTH * distance) * (grid.extent[0] ** 2 + grid.extent[1] ** 2)
-        return Answer(far(field[None])[0].abs(), error, tolerance=max(error, ROUNDING))
+        return Answer(operator(field[None])[0].abs(), error, tolerance=max(error, ROUNDING))
 
     def exact(distance: float) -> Tensor:
         step = WAVELENGTH * distance / grid.extent[0]

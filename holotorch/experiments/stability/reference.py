@@ -42,8 +42,8 @@ def propagated(
         sines.append(wavelength * f + tilt[axis])
     columns, total = source @ sent[1].T, np.zeros(out.shape, complex)
     step = max(1, _CHUNK // len(sines[1]))
-    for begin in range(0, len(sines[0]), step):
-        rows = slice(begin, begin + step)
+    for start in range(0, len(sines[0]), step):
+        rows = slice(start, start + step)
         root = np.sqrt(1 - sines[0][rows, None] ** 2 - sines[1] ** 2 + 0j)
         # The root is imaginary for evanescent waves, which decay for either sign of the distance.
         phase = 2j * np.pi / wavelength * (distance * root.real + 1j * abs(distance) * root.imag)
@@ -56,12 +56,12 @@ def _cycles(
 ) -> float:
     """Cycles by which the integrand turns over the band of one axis, at most, for light of up to ``sine``."""
     farthest = 0.0
-    for own in (tilt[axis] - sine, tilt[axis] + sine):
+    for offset in (tilt[axis] - sine, tilt[axis] + sine):
         for other in (tilt[1 - axis] - sine, tilt[1 - axis] + sine):
-            cosine = math.sqrt(max(1 - own**2 - other**2, _STEEPEST**2))
+            cosine = math.sqrt(max(1 - offset**2 - other**2, _STEEPEST**2))
             for start in (positions[0], positions[-1]):
                 for end in (reached[0], reached[-1]):
-                    farthest = max(farthest, abs(start + distance * own / cosine - end))
+                    farthest = max(farthest, abs(start + distance * offset / cosine - end))
     return farthest / pitch
 
 
@@ -80,3 +80,10 @@ def _nodes(cycles: float) -> tuple[np.ndarray, np.ndarray]:
 def noise(shape: tuple[int, ...], seed: int = 0, dtype: torch.dtype = torch.complex128) -> Tensor:
     """Independent normal numbers of a seed, the content that most methods predict errors for."""
     return torch.randn(*shape, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def noise_inside(grid: Grid) -> Tensor:
+    """Noise within the middle half of the window, complex128 [1, H, W], so that little light leaves it."""
+    y, x = grid.coordinates()
+    inside = (y.abs() < grid.extent[0] / 4) & (x.abs() < grid.extent[1] / 4)
+    return (noise(grid.shape) * inside)[None]

@@ -44,17 +44,14 @@ class View:
         display = Display(self.lens_distance, self.focal_length, self.eye_distance, self.lens_radius)
         return display, Eye(self.pupil / 2, accommodation=self.accommodation)
 
-    def field(self) -> Tensor:
-        """Noise within the middle half of the window, complex128 [1, H, W], so that little light leaves it."""
-        y, x = self.grid.coordinates()
-        inside = (y.abs() < self.grid.extent[0] / 4) & (x.abs() < self.grid.extent[1] / 4)
-        return (reference.noise(self.grid.shape) * inside)[None]
-
     def retina(self) -> Answer:
         """What ``Retina`` gives."""
         retina = Retina(self.grid, self.wavelength, *self.optics, tolerance=self.tolerance)
         return Answer(
-            retina(self.field()), retina.plan.predicted_error, retina.plan.method, self.tolerance or TOLERANCE
+            retina(reference.noise_inside(self.grid)),
+            retina.plan.predicted_error,
+            retina.plan.method,
+            self.tolerance or TOLERANCE,
         )
 
 
@@ -66,7 +63,9 @@ def _exact(view: View) -> Tensor:
     finer = replace(
         least, oversampling=(_FINER * y, _FINER * x), fine=(math.ceil(_FINER * rows), math.ceil(_FINER * columns))
     )
-    return intensity(propagate_elements(view.field(), view.grid, view.wavelength, *view.optics, sampling=finer))
+    return intensity(
+        propagate_elements(reference.noise_inside(view.grid), view.grid, view.wavelength, *view.optics, sampling=finer)
+    )
 
 
 def sweeps() -> list[Sweep]:

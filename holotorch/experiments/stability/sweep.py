@@ -58,7 +58,7 @@ class Point:
 
     @property
     def ok(self) -> bool:
-        """Whether the error is small enough, or the method said that it may not be."""
+        """Whether the error is small enough, or the method warned that it may not be."""
         return self.said in ("warned", "refused") or self.measured <= SILENT * self.tolerance
 
     @property

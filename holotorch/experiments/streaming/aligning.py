@@ -109,8 +109,8 @@ class Aligner:
             return f"the camera does not see the catheter ({pose.reason or 'refused'}); hold its bands into the picture"
         if len(self._pairs) == _MOST:
             return f"{_MOST} alignments are enough; save them"
-        own = (pose.tip, pose.direction, tip, direction / direction.norm())
-        self._pairs.append(torch.cat([each.detach().to("cpu", torch.float64) for each in own]))
+        tool = (pose.tip, pose.direction, tip, direction / direction.norm())
+        self._pairs.append(torch.cat([part.detach().to("cpu", torch.float64) for part in tool]))
         return ""
 
     def _solve(self) -> str:

@@ -51,7 +51,7 @@ async def _rows(port: int, packets: int) -> list[tuple[bool, str]]:
         PoseReceiver(0, host=_LOOPBACK) as two,
         PoseReceiver(0, host=_LOOPBACK) as behind_relay,
         Relay(behind_relay.port) as relay,
-        PoseSender([(_LOOPBACK, each.port) for each in (one, two, relay)]) as sender,
+        PoseSender([(_LOOPBACK, receiver.port) for receiver in (one, two, relay)]) as sender,
     ):
         await _send(sender, packets)
         for _ in range(200):
@@ -141,13 +141,13 @@ async def _panel(count: int) -> tuple[bool, str]:
         ClientSession() as session,
         session.ws_connect(server.address + "poses") as socket,
     ):
-        begin = now()
-        while len(delays) < count and now() < begin + count / 30 * 4 + 2:
+        start = now()
+        while len(delays) < count and now() < start + count / 30 * 4 + 2:
             with suppress(TimeoutError):
                 message = await asyncio.wait_for(socket.receive(), 1.0)
                 if message.type is WSMsgType.BINARY:
                     delays.append(now() - struct.unpack_from("<d", message.data, 1)[0])
-        rate = len(delays) / (now() - begin)
+        rate = len(delays) / (now() - start)
     median = float(torch.tensor(delays or [math.inf]).median())
     good = median < _PICTURE
     advice = "" if good else f"; above {_PICTURE * 1e3:g} ms: close what keeps this computer busy, and try again"
@@ -247,9 +247,9 @@ class Relay(UdpSocket):
         newest: Largest number of a forwarded packet; packets are numbered in the order of arrival.
     """
 
-    def __init__(self, port: int, seed: int = 7):
+    def __init__(self, port: int):
         super().__init__(0, _LOOPBACK)
-        self._to, self._random = (_LOOPBACK, port), random.Random(seed)
+        self._to, self._random = (_LOOPBACK, port), random.Random(7)
         self.came, self.dropped, self.overtaken, self.repeated, self.newest = 0, 0, 0, 0, -1
         self._delayed: list[tuple[int, int, bytes]] = []  # number of the packet at which it is due, its number, content
 

@@ -42,8 +42,8 @@ def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     stream.add_argument("--packets", type=_count, metavar="N", help=about)
     stream.add_argument("--port", type=_port, default=18950, help="where --view and --check listen (default: 18950)")
     stream.set_defaults(action=_stream)
-    for name, words in FILES.items():
-        stream.add_argument(name, type=Path, help=words)
+    for name, explanation in FILES.items():
+        stream.add_argument(name, type=Path, help=explanation)
 
 
 def _port(text: str) -> int:

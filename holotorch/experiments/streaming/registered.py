@@ -94,7 +94,7 @@ def register(
     samples = interpolate(values, shape, mode="area")[0, 0].to(torch.float16)
     # Index of a point along an axis: (its place - origin) . direction / spacing; the faces are half a voxel out.
     axes = torch.tensor(volume.orientation, dtype=torch.float64).flip(0, 1)  # rows and components in the order x, y, z
-    spacing, origin = (torch.tensor(each, dtype=torch.float64).flip(0) for each in (volume.spacing, volume.origin))
+    spacing, origin = (torch.tensor(triple, dtype=torch.float64).flip(0) for triple in (volume.spacing, volume.origin))
     count = torch.tensor(volume.shape, dtype=torch.float64).flip(0)
     texture_from_volume = torch.eye(4, dtype=torch.float64)
     texture_from_volume[:3, :3] = axes / (spacing * count)[:, None]

@@ -164,8 +164,8 @@ def stream(
         raise ConfigError([f"rate must be above 0 Hz, got {rate}"])
     if len(sources) == 1 and sources[0].lower().endswith(".csv"):
         recorded = read_poses(Path(sources[0]))
-        turns = itertools.count() if repeat else range(1)
-        poses: Iterable[TimedPose] = itertools.chain.from_iterable(replay(recorded, rate) for _ in turns)
+        repetitions = itertools.count() if repeat else range(1)
+        poses: Iterable[TimedPose] = itertools.chain.from_iterable(replay(recorded, rate) for _ in repetitions)
     elif sources and track is not None:
         poses = track(sources)
     else:
@@ -174,7 +174,7 @@ def stream(
         server = None if igtl is None else TransformServer(igtl, name=frames[headset].transform)
     except ImportError as error:
         raise ConfigError([str(error)]) from None
-    senders = [(frames[file], PoseSender(places, frame=frames[file].name)) for file, places in receivers.items()]
+    senders = [(frames[file], PoseSender(to, frame=frames[file].name)) for file, to in receivers.items()]
     servers = [] if server is None else [(frames[headset], server)]
     pages = [] if page is None else [(page.aligner or frames[headset], page)]
     count, complete = [0], True

@@ -20,14 +20,14 @@ class Point(NamedTuple):
     values: dict[str, str]  # swept keys and their values as written
 
 
-def points(words: Sequence[str]) -> list[Point]:
+def points(arguments: Sequence[str]) -> list[Point]:
     """All combinations of ``key=a,b,c``; a key with one value is fixed. Commas in brackets and quotes separate nothing.
 
     ConfigError for words that are no settings, values that appear twice, keys given twice, or more than 10,000 points.
     """
     mistakes: list[str] = []
     choices: dict[str, list[str]] = {}
-    for word in words:
+    for word in arguments:
         key, equals, text = word.partition("=")
         values = _split(text)
         if not equals or not key:
@@ -53,7 +53,7 @@ def points(words: Sequence[str]) -> list[Point]:
     ]
     if len(grid) > MOST:
         raise ConfigError([f"expected at most {MOST} runs in a sweep"])
-    return [Point(_name(each), (*fixed, *(f"{k}={v}" for k, v in each.items())), each) for each in grid]
+    return [Point(_name(values), (*fixed, *(f"{k}={v}" for k, v in values.items())), values) for values in grid]
 
 
 def _split(text: str) -> list[str]:

@@ -43,11 +43,11 @@ def write_results(out: Path, points: Sequence[Point], statuses: dict[str, str]) 
 def draw(out: Path, points: Sequence[Point], summaries: dict[str, dict[str, Any]]) -> bytes | None:
     """PNG of up to three quantities against the first swept key, with a line for each value of the others, or None."""
     key = next(iter(points[0].values))
-    places = [_number(out / point.name, key) for point in points]
+    values = [_number(out / point.name, key) for point in points]
     ticks = list(dict.fromkeys(point.values[key] for point in points))
     x = [
-        ticks.index(point.values[key]) if None in places else place or 0.0
-        for point, place in zip(points, places, strict=True)
+        ticks.index(point.values[key]) if None in values else value or 0.0
+        for point, value in zip(points, values, strict=True)
     ]
     merits = _merits([summaries[point.name] for point in points])
     if not merits:
@@ -63,7 +63,7 @@ def draw(out: Path, points: Sequence[Point], summaries: dict[str, dict[str, Any]
                 lines.setdefault(label, []).append((place, value))
         for k, (label, line) in enumerate(lines.items()):
             axes.plot(*zip(*sorted(line), strict=True), "os^vD*PhX"[k % 9] + "-", label=label or None, markersize=5)
-        if None in places:
+        if None in values:
             axes.set_xticks(range(len(ticks)), ticks, fontsize=8)
         elif min(x) > 0 and max(x) / min(x) >= 30:
             axes.set_xscale("log")
@@ -92,12 +92,12 @@ def _flat(value: Any, name: str = "") -> list[tuple[str, Any]]:
 
 def _merits(summaries: Sequence[dict[str, Any]]) -> list[str]:
     """Columns to draw: one for each of ``_MERITS`` that varies, of the result rather than of a baseline."""
-    found = []
+    merits = []
     for ending in _MERITS:
         named = [name for name in summaries[0] if name.rpartition(".")[2] == ending]
         named.sort(key=lambda name: (not re.search(r"corrected|joint", name), name.count(".")))
-        found += [name for name in named[:1] if len({str(each.get(name)) for each in summaries}) > 1]
-    return found[:_PANELS]
+        merits += [name for name in named[:1] if len({str(summary.get(name)) for summary in summaries}) > 1]
+    return merits[:_PANELS]
 
 
 def _number(folder: Path, key: str) -> float | None:

@@ -17,14 +17,14 @@ from holotorch.experiments.sweep.points import Point, points
 from holotorch.experiments.sweep.results import PAGE, TABLE, finished, write_results
 
 
-def check_sweep(config: str, words: Sequence[str]) -> str:
+def check_sweep(config: str, arguments: Sequence[str]) -> str:
     """The number of runs and their predicted cost in words. ConfigError with the mistakes of all runs."""
-    grid = points(words)
+    grid = points(arguments)
     settings = _validated(config, grid)
     times, memory, shortages = [], 0.0, []
-    for each in tqdm(settings, desc="planning", unit="run", disable=None):
-        kind = find_kind(each.experiment)
-        plan = kind.plan(kind.build(each))
+    for setting in tqdm(settings, desc="planning", unit="run", disable=None):
+        kind = find_kind(setting.experiment)
+        plan = kind.plan(kind.build(setting))
         times += [plan.values["predicted_seconds"]] if "predicted_seconds" in plan.values else []
         memory = max(memory, plan.values.get("predicted_peak_bytes", 0.0))
         shortages += [plan.shortage] if plan.shortage else []
@@ -32,12 +32,12 @@ def check_sweep(config: str, words: Sequence[str]) -> str:
         raise ConfigError(list(dict.fromkeys(shortages)))
     cost = f"about {max(1, sum(times)):.3g} s one after the other" if times else "the time is not predicted"
     most = f"; at most {memory / 1e9:.2g} GB of memory for each" if memory else ""
-    swept = ", ".join(f"{key} ({len({each.values[key] for each in grid})})" for key in grid[0].values)
+    swept = ", ".join(f"{key} ({len({point.values[key] for point in grid})})" for key in grid[0].values)
     return f"{len(grid)} runs of {config} over {swept}: {cost}{most}"
 
 
 def run_sweep(
-    config: str, words: Sequence[str], out: Path, *, jobs: int = 1, slurm: Sequence[str] | None = None
+    config: str, arguments: Sequence[str], out: Path, *, jobs: int = 1, slurm: Sequence[str] | None = None
 ) -> int:
     """Carry out the missing runs of a sweep, write its table, picture and page, and return the exit status.
 
@@ -46,7 +46,7 @@ def run_sweep(
     """
     if jobs < 1:
         raise ConfigError([f"--jobs: expected 1 or more, got {jobs}"])
-    grid = points(words)
+    grid = points(arguments)
     settings = _validated(config, grid)
     missing = [point for point, each in zip(grid, settings, strict=True) if not _complete(out / point.name, each)]
     out.mkdir(parents=True, exist_ok=True)

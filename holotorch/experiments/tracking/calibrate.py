@@ -38,7 +38,7 @@ def calibrate_photographs(
     Raises:
         ConfigError: The photographs cannot be read, differ in size, show no board, or do not determine a camera.
     """
-    wanted = parse_board(board)
+    kind = parse_board(board)
     if out.exists():
         raise ConfigError([f"{out} exists already; choose another --out or delete it"])
     paths = _listed(files)
@@ -59,7 +59,7 @@ def calibrate_photographs(
             continue
         sizes[name] = grey.shape[0], grey.shape[1]
         try:
-            views.append(find_board(grey, wanted, name))
+            views.append(find_board(grey, kind, name))
         except ValueError as error:
             missing[name] = str(error)
     usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
@@ -80,9 +80,9 @@ def calibrate_photographs(
     return calibration, missing
 
 
-def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
+def parse_board(arguments: Sequence[str]) -> Chessboard | Charuco:
     """Create the board that the words after ``--board`` describe. Raises ConfigError if they describe no board."""
-    text, sides = " ".join(" ".join(words).split()), r"(\d{1,3})x(\d{1,3})"
+    text, sides = " ".join(" ".join(arguments).split()), r"(\d{1,3})x(\d{1,3})"
     chessboard = re.fullmatch(rf"chessboard {sides} (\S+)", text)
     charuco = re.fullmatch(rf"charuco {sides} (\S+) (\S+) (\S+)", text)
     try:
@@ -93,7 +93,7 @@ def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
             return Charuco(int(charuco[1]), int(charuco[2]), square, marker, dictionary=charuco[5])
     except (PydanticCustomError, ValueError) as error:
         raise ConfigError([f"--board: {error}"]) from None
-    raise ConfigError([f"--board: expected {_KINDS}, got {' '.join(words)!r}"])
+    raise ConfigError([f"--board: expected {_KINDS}, got {' '.join(arguments)!r}"])
 
 
 def _side(text: str) -> float:
@@ -108,13 +108,13 @@ def calibration_text(calibration: Calibration, missing: dict[str, str], board: S
     """Lines of text that ``holotorch calibrate`` prints: camera, board, coverage, views and warnings."""
     matrix, distortion = calibration.camera.matrix, calibration.camera.distortion.tolist()
     values = [matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item(), matrix[1, 2].item(), *distortion]
-    words = [f"{name} {_rounded(x, calibration.deviations[name])}" for name, x in zip(PARAMETERS, values, strict=True)]
+    parts = [f"{name} {_rounded(x, calibration.deviations[name])}" for name, x in zip(PARAMETERS, values, strict=True)]
     coverage = calibration.coverage
     between = f", {math.degrees(coverage.between):.0f} deg between boards at most" if len(calibration.views) > 1 else ""
     low, high = (math.degrees(angle) for angle in coverage.tilts)
     lines = [
-        f"Camera     {', '.join(words[:4])} px, for frames of {calibration.size[1]} x {calibration.size[0]} px",
-        f"Distortion {', '.join(words[4:])}",
+        f"Camera     {', '.join(parts[:4])} px, for frames of {calibration.size[1]} x {calibration.size[0]} px",
+        f"Distortion {', '.join(parts[4:])}",
         f"Board      {describe_board(parse_board(board))}, rms {calibration.rms_px:.2f} px, "
         f"views: {len(calibration.views)}",
         f"Coverage   {100 * coverage.cells:.0f} % of the picture, {100 * coverage.radius:.0f} % of the way to its "

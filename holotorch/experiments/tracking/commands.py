@@ -45,8 +45,8 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     track.add_argument(
         "--headset", type=Path, metavar="FILE", help="write poses in its frame too; see calibrate headset"
     )
-    for name, words in FILES.items():
-        track.add_argument(name, type=Path, help=words)
+    for name, explanation in FILES.items():
+        track.add_argument(name, type=Path, help=explanation)
 
 
 def _track(options: argparse.Namespace) -> int:
@@ -77,8 +77,8 @@ def _calibrate(options: argparse.Namespace) -> int:
 
     if options.files[0] == Path("catheter"):
         if len(options.files) != 2 or not options.bands or options.board or options.axes:
-            wanted = "calibrate catheter: expected one photograph and --bands X,Y X,Y X,Y, without --board and --axes"
-            raise ConfigError([wanted])
+            expected = "calibrate catheter: expected one photograph and --bands X,Y X,Y X,Y, without --board and --axes"
+            raise ConfigError([expected])
         from holotorch.experiments.tracking.photograph import calibrate_catheter
 
         out = options.out or Path("catheter.yaml")

@@ -40,8 +40,8 @@ def working_range(camera: Camera, catheter: Catheter) -> tuple[float, str]:
     return min(limits)
 
 
-def _certain(camera: Camera, catheter: Catheter, most: float) -> float:
-    """Largest distance in metres up to which edges determine the tip to ``most`` metres."""
+def _certain(camera: Camera, catheter: Catheter, max_error: float) -> float:
+    """Largest distance in metres up to which edges determine the tip to ``max_error`` metres."""
     positions, matrix = catheter.positions, camera.matrix.detach().double()
     z = torch.logspace(math.log10(_NEAREST), math.log10(_FARTHEST), _STEPS, dtype=torch.float64)
     along = positions - (positions[0] + positions[-1]) / 2
@@ -49,7 +49,7 @@ def _certain(camera: Camera, catheter: Catheter, most: float) -> float:
     pinhole = Camera(matrix, torch.zeros(5, dtype=torch.float64))
     edges = torch.stack([x, matrix[1, 2].expand_as(x)], -1)
     pose = solve_pose(edges, positions, pinhole, along_px=_EDGE, across_px=_EDGE)
-    certain = pose.tip_sd <= most
+    certain = pose.tip_sd <= max_error
     return float(z[certain].max()) if bool(certain.any()) else _NEAREST
 
 

@@ -76,10 +76,10 @@ def read_alignments(path: Path) -> Tensor:
 def axes_matrix(axes: str) -> Tensor:
     """Matrix [3, 3] from coordinates along ``axes`` to RDF; ConfigError unless they are three different directions."""
     letters = [_LETTERS.get(letter) for letter in axes.upper()]
-    known = [each for each in letters if each is not None]
+    known = [letter for letter in letters if letter is not None]
     if len(axes) != 3 or sorted(axis for axis, _ in known) != [0, 1, 2]:
-        words = "one of R L, one of U D and one of F B, such as RDF, RUB (WebXR) or RUF (Unity)"
-        raise ConfigError([f"--axes: expected {words}, got {axes!r}"])
+        expected = "one of R L, one of U D and one of F B, such as RDF, RUB (WebXR) or RUF (Unity)"
+        raise ConfigError([f"--axes: expected {expected}, got {axes!r}"])
     matrix = torch.zeros(3, 3, dtype=torch.float64)
     for column, (axis, sign) in enumerate(known):
         matrix[axis, column] = sign
@@ -94,11 +94,11 @@ def alignment_text(alignment: Alignment, headset: Tensor) -> str:
         f"Alignments {len(left_out)}, residuals {1e3 * float(alignment.residuals.square().mean().sqrt()):.2f} mm (rms)",
         f"Tip        expected within {1e3 * expected:.2f} mm (standard deviation, in the middle of the alignments)",
     ]
-    for number, (own, other) in enumerate(zip(alignment.residuals.tolist(), left_out.tolist(), strict=True), 1):
+    for number, (residual, other) in enumerate(zip(alignment.residuals.tolist(), left_out.tolist(), strict=True), 1):
         without = (
             f"{1e3 * other:.2f} mm from the others" if math.isfinite(other) else "the others alone determine nothing"
         )
-        lines.append(f"Alignment  {number}: {1e3 * own:.2f} mm; {without}")
+        lines.append(f"Alignment  {number}: {1e3 * residual:.2f} mm; {without}")
     finite = left_out[left_out.isfinite()]
     if len(finite) > 3 and float(finite.max()) > _SLIPPED * float(finite.median()):
         worst = int(torch.where(left_out.isfinite(), left_out, 0.0).argmax()) + 1

@@ -54,8 +54,8 @@ def calibrate_catheter(
         ColourTable(camera, catheter)
     except ValueError as error:
         listed = ", ".join(f"{place}: {list(level)}" for place, level in zip(places, levels, strict=True))
-        words = "photograph the bands in even light without gloss, or paint others"
-        raise ConfigError([f"{photograph}: {error}; found {listed}: {words}"]) from None
+        advice = "photograph the bands in even light without gloss, or paint others"
+        raise ConfigError([f"{photograph}: {error}; found {listed}: {advice}"]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
     save_catheter(out, catheter)
     lines = [
@@ -108,8 +108,8 @@ def _boxes(places: Sequence[str], bands: int, size: Sequence[int]) -> list[tuple
         x, y = int(match[1]), int(match[2])
         box = (x, y, int(match[3]), int(match[4])) if match[3] else (x, y, x, y)
         if not (box[0] <= box[2] < size[1] and box[1] <= box[3] < size[0]):
-            wanted = f"places on the picture of {size[1]} x {size[0]} px, X0,Y0 before X1,Y1"
-            mistakes.append(f"--bands: expected {wanted}, got {place!r}")
+            expected = f"places on the picture of {size[1]} x {size[0]} px, X0,Y0 before X1,Y1"
+            mistakes.append(f"--bands: expected {expected}, got {place!r}")
         if not match[3]:
             box = (max(0, x - _AROUND), max(0, y - _AROUND), x + _AROUND, y + _AROUND)
         boxes.append(box)

@@ -115,8 +115,8 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
         summary["milliseconds"] = {"first": float(taken[0])} | {name: quantile(taken, share) for name, share in shares}
     if log.stages:
         counted = log.stages[1:] or log.stages  # without the first call, which also builds tables
-        names = dict.fromkeys(name for each in counted for name in each)
-        means = {name: fmean(each.get(name, 0.0) for each in counted) for name in names}
+        names = dict.fromkeys(name for counts in counted for name in counts)
+        means = {name: fmean(counts.get(name, 0.0) for counts in counted) for name in names}
         total = max(sum(means.values()), 1e-12)
         summary["stages"] = [
             {"stage": name, "milliseconds": 1e3 * mean, "percent": 100 * mean / total} for name, mean in means.items()
@@ -141,8 +141,8 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
 
 def verdict(summary: dict[str, Any]) -> str:
     """The summary in one line."""
-    words = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
-    text = f"Frames     {summary['answered']} of {summary['frames']} with a pose ({words})"
+    statuses = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
+    text = f"Frames     {summary['answered']} of {summary['frames']} with a pose ({statuses})"
     if "milliseconds" in summary:
         text += f"; {summary['milliseconds']['median']:.1f} ms each, slowest {summary['milliseconds']['largest']:.1f}"
     if "stability" in summary:

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import math
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,7 +27,7 @@ from holotorch.experiments.tracking.forecast import range_text
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
 from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
 from holotorch.experiments.tracking.synthetic import compared, errors, read_truth, synthetic_rig, write_synthetic
-from holotorch.io.files import append, replacing, write_bytes
+from holotorch.io.files import append, replacing, without_nan, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
 from holotorch.tracking import Pose, Status
@@ -189,10 +188,10 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         pass
     except Exception as error:  # it is raised again after the poses before it are saved
         failure = error
-    with deferred(run.pressed):
-        for each in reversed(opened):  # each is closed as after a success, even if closing another one fails
+    with deferred(run.signals):
+        for context in reversed(opened):  # each is closed as after a success, even if closing another one fails
             try:
-                each.__exit__(None, None, None)
+                context.__exit__(None, None, None)
             except OSError as error:
                 failure = failure or error
         if not log.statuses:
@@ -213,8 +212,8 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         results.write(save_figure, folder, log)
         if failure is not None:
             results.failure = None  # only the first failure is reported
-        done = failure is None and (not run.pressed or frames.live)
-        complete = conclude(run, _without_nan(summary), results, done=done)
+        done = failure is None and (not run.signals or frames.live)
+        complete = conclude(run, without_nan(summary), results, done=done)
     if failure is not None:
         raise failure
     return complete
@@ -247,10 +246,10 @@ def _track_all(
         movie = entered(replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
     if settings.record:
         recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, inputs.paths)
-        source = _recorded(source, entered(recorder), run.pressed)
+        source = _recorded(source, entered(recorder), run.signals)
     bar = entered(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
     for item in follow(source, inputs.tracker):
-        with deferred(run.pressed):
+        with deferred(run.signals):
             _append(table, row(item))
             if in_headset and experiment.to_headset:
                 _append(in_headset, row(item._replace(pose=experiment.to_headset(item.pose))))
@@ -264,14 +263,14 @@ def _track_all(
             log.take(item, drawn)
             bar.set_postfix_str(f"{item.status.name}, {1e3 * item.seconds:.1f} ms", refresh=False)
             bar.update()
-        if run.pressed:
+        if run.signals:
             break
 
 
-def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:
+def _recorded(frames: Iterator[Frame], recorder: Recorder, signals: list[int]) -> Iterator[Frame]:
     """Record each frame and then yield it."""
     for frame in frames:
-        with deferred(pressed):
+        with deferred(signals):
             recorder.write(frame)
         yield frame
 
@@ -286,12 +285,3 @@ def _holds_frames(folder: Path) -> bool:
     """Whether the folder contains a pose, a refusal, or a recorded frame."""
     tables = (folder / "poses.csv", folder / "recording" / "times.csv")
     return any(path.is_file() and path.read_bytes().count(b"\n") > 1 for path in tables)
-
-
-def _without_nan(value: Any) -> Any:
-    """Replace NaN and infinity by None, since JSON cannot represent them and the summary could not be written."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

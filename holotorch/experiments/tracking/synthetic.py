@@ -125,12 +125,12 @@ def read_truth(folder: Path) -> dict[str, list[float]]:
     path = folder / "truth.csv"
     if not path.is_file():
         return {}
-    wanted, truth = ("frame", *_TIP), dict[str, list[float]]()
+    columns, truth = ("frame", *_TIP), dict[str, list[float]]()
     try:
         with open(path, newline="", encoding="utf-8") as stream:
             table = csv.DictReader(stream)
             names = table.fieldnames or ()
-            if missing := [name for name in wanted if name not in names]:
+            if missing := [name for name in columns if name not in names]:
                 if not is_recording(folder):
                     return {}
                 raise ConfigError([f"{path}:1: columns {', '.join(missing)} are missing, got {', '.join(names)}"])
@@ -140,7 +140,7 @@ def read_truth(folder: Path) -> dict[str, list[float]]:
                     if not all(map(math.isfinite, tip)) or frame in truth:
                         raise ValueError
                 except (TypeError, ValueError):
-                    got = ",".join(str(row[name]) for name in wanted)
+                    got = ",".join(str(row[name]) for name in columns)
                     text = "the number of a frame, each once, and a finite tip in metres"
                     raise ConfigError([f"{path}:{table.line_num}: expected {text}, got {got}"]) from None
                 truth[frame] = tip

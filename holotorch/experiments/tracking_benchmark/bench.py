@@ -111,15 +111,15 @@ def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tupl
     """
     parts = {"2D": world.grid_2d()} | {f"3D {face}": cases for face, cases in world.grid_3d().items()}
     every = max(1, round(1 / share))
-    found = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
+    answered = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
     rows = []
     for name in trackers:
-        own_rows = [_grid_row(part, name, given) for part, given in found.items()]
-        whole = _grid_row("3D", name, [answer for part, given in found.items() if part != "2D" for answer in given])
+        own_rows = [_grid_row(part, name, given) for part, given in answered.items()]
+        whole = _grid_row("3D", name, [answer for part, given in answered.items() if part != "2D" for answer in given])
         known = [row["acc_mm"] for row in own_rows[1:] if row["acc_mm"] != ""]
         whole["acc_mm"] = round(sum(known) / len(known), 4) if known else ""  # mean over the faces, as in the thesis
         rows += [*own_rows, whole]
-    return rows, [answer for given in found.values() for answer in given]
+    return rows, [answer for given in answered.values() for answer in given]
 
 
 def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
@@ -128,12 +128,12 @@ def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tup
     rows, all_answers = [], []
     for codec, changes in _CODECS.items():
         cases = replace(world, look=replace(world.look, **changes)).grid_2d()[::every]
-        found = list(answers(cases, trackers, codec))
+        answered = list(answers(cases, trackers, codec))
         for name in trackers:
-            row = _grid_row("2D", name, found)
+            row = _grid_row("2D", name, answered)
             kept = ("method", "points", "refused", "median_mm", "p95_mm", "worst_mm", "coverage")
             rows.append({"codec": codec} | {key: row[key] for key in kept})
-        all_answers += found
+        all_answers += answered
     return rows, all_answers
 
 
@@ -171,9 +171,9 @@ def scenes(
         cases = [replace(case, name=f"{case.name}, seed {one.seed}") for one in worlds for case in conditions(one)]
     else:
         cases = occlusions(world, count)
-    found = list(answers(cases[:: max(1, round(1 / share))], trackers, kind))
+    answered = list(answers(cases[:: max(1, round(1 / share))], trackers, kind))
     rows = []
-    for (name, method), own in _by(found, lambda answer: (_scene(answer.name), answer.method)).items():
+    for (name, method), own in _by(answered, lambda answer: (_scene(answer.name), answer.method)).items():
         errors = sorted(answer.error for answer in own if answer.answered)
         refused = [answer for answer in own if not answer.answered]
         fitting: Any = ""
@@ -185,7 +185,7 @@ def scenes(
         row |= {"worst_error_mm": _mm(errors[-1]) if errors else ""}
         row["statuses"] = count_statuses(answer.status for answer in own)
         rows.append(row | {"reason": next((answer.reason for answer in refused), "")})
-    return rows, found
+    return rows, answered
 
 
 def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
@@ -193,14 +193,14 @@ def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
 
     ``numbers_of_false`` lists the numbers of the frames in which the method found a pose.
     """
-    found = list(answers(negatives(world, count), trackers, "negatives"))
+    answered = list(answers(negatives(world, count), trackers, "negatives"))
     rows = []
-    for (kind, method), own in _by(found, lambda answer: (answer.name.split(", ")[1], answer.method)).items():
+    for (kind, method), own in _by(answered, lambda answer: (answer.name.split(", ")[1], answer.method)).items():
         false = [answer.name.split(",")[0].split()[-1] for answer in own if answer.answered]
         row: Row = {"kind": kind, "method": method, "frames": len(own), "false": len(false)}
         row["statuses"] = count_statuses(answer.status for answer in own)
         rows.append(row | {"seed": world.seed, "numbers_of_false": " ".join(false)})
-    return rows, found
+    return rows, answered
 
 
 def one(rows: list[Row], **wanted: Any) -> Row:
@@ -251,10 +251,10 @@ def _grid_row(part: str, name: str, given: list[Answer]) -> Row:
     return row
 
 
-def _by(found: Iterable[Answer], key: Callable[[Answer], Any]) -> dict[Any, list[Answer]]:
+def _by(given: Iterable[Answer], key: Callable[[Answer], Any]) -> dict[Any, list[Answer]]:
     """Answers grouped by a key, in the order in which the keys first occur."""
     groups: dict[Any, list[Answer]] = {}
-    for answer in found:
+    for answer in given:
         groups.setdefault(key(answer), []).append(answer)
     return groups
 

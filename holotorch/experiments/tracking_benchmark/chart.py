@@ -86,7 +86,7 @@ def tracking(
     boards = shared_photographs(boards_folder) if boards_folder else [drawn_photograph()]
     tables["real_pixels"], sheet, found = real_pixels(boards, amount.placed)
     # The frames of catheters at rest are left out of the sum: they repeat a few poses.
-    answers[_ALL] = [each for kind in ("grids", "codecs", "conditions", "occlusions") for each in answers[kind]]
+    answers[_ALL] = [answer for kind in ("grids", "codecs", "conditions", "occlusions") for answer in answers[kind]]
     tables["reliability"] = [
         _share(kind, name, own)
         for kind, given in answers.items()
@@ -119,7 +119,7 @@ def _methods(tables: dict[str, list[Row]], answers: dict[str, list[Answer]]) -> 
         row: Row = {"method": name, "data": "synthetic"}
         timed = one(tables["times"], frame=_PLAIN, method=name)
         row |= {"milliseconds": timed["milliseconds"], "ratio": timed["ratio"]}
-        worst = max(each["ratio"] for each in tables["times"] if each["method"] == name)
+        worst = max(row["ratio"] for row in tables["times"] if row["method"] == name)
         row |= {"worst_ratio_of_frames": worst}
         for grid in ("2D", "3D"):
             errors = one(tables["grids"], grid=grid, method=name)

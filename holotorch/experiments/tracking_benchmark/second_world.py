@@ -47,8 +47,8 @@ def verdict(rows: list[Row], goal: Callable[[float, float], str]) -> list[str]:
     ``goal`` turns a value and the largest one that is aimed at into text; only the tracker has such goals.
     """
 
-    def aim(method: object, value: float | str, most: float) -> str:
-        return goal(float(value), most) if method == COLD and value != "" else ""
+    def aim(method: object, value: float | str, limit: float) -> str:
+        return goal(float(value), limit) if method == COLD and value != "" else ""
 
     lines = []
     for row in rows:

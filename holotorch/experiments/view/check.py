@@ -21,12 +21,12 @@ def check(viewer: Viewer, show: Callable[[str], None] = print) -> None:
         viewer.show(start, False, _proceed)  # fills the caches
         for control in viewer.controls:
             if isinstance(control, Slider):
-                each = [control.low + (control.high - control.low) * (0.3 + 0.05 * k) for k in range(2 * _PICTURES)]
+                values = [control.low + (control.high - control.low) * (0.3 + 0.05 * k) for k in range(2 * _PICTURES)]
             else:
                 options = list(control.options)
-                each = [options[k % len(options)] for k in range(2 * _PICTURES)]
-            moving = median(_seconds(viewer, start | {control.name: value}, True) for value in each[:_PICTURES])
-            resting = median(_seconds(viewer, start | {control.name: value}, False) for value in each[_PICTURES:])
+                values = [options[k % len(options)] for k in range(2 * _PICTURES)]
+            moving = median(_seconds(viewer, start | {control.name: value}, True) for value in values[:_PICTURES])
+            resting = median(_seconds(viewer, start | {control.name: value}, False) for value in values[_PICTURES:])
             bare = median(_bare_seconds(viewer) for _ in range(_PICTURES))
             ratio = f"{moving / bare:.1f} times two bare transforms" if bare else ""
             name = f"{control.label[:28]:28}"

@@ -136,7 +136,7 @@ def encoded(number: int, shown: Shown, seconds: float) -> bytes:
     files = [{"name": each.name, "caption": each.caption, "bytes": len(each.png)} for each in shown.pictures]
     header = {"number": number, "coarse": shown.coarse, "seconds": seconds, "pictures": files}
     text = json.dumps(header | {"numbers": list(shown.numbers.items())}, allow_nan=False).encode()
-    return struct.pack("<I", len(text)) + text + b"".join(each.png for each in shown.pictures)
+    return struct.pack("<I", len(text)) + text + b"".join(picture.png for picture in shown.pictures)
 
 
 class _Page:

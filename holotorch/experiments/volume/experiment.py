@@ -152,7 +152,7 @@ class VolumeExperiment:
     def dtype(self) -> torch.dtype:
         """Precision of the fields: complex128 if a tolerance is below 10 times the rounding error of complex64."""
         asked = self.settings.tolerance, self.settings.hologram.tolerance
-        least = min((each for each in asked if each is not None), default=1.0)
+        least = min((error for error in asked if error is not None), default=1.0)
         return torch.complex128 if least < _SINGLE else torch.complex64
 
     @cached_property
@@ -275,12 +275,12 @@ class VolumeExperiment:
         return [depth / self.settings.scale for depth in self.settings.report.refocus or ()]
 
 
-def _joined(depths: Sequence[float], most: int) -> Sequence[float]:
-    """``depths`` if they are at most ``most``; otherwise the means of that many groups of neighbours."""
+def _joined(depths: Sequence[float], limit: int) -> Sequence[float]:
+    """``depths`` if they are at most ``limit``; otherwise the means of that many groups of neighbours."""
     count = len(depths)
-    if count <= most:
+    if count <= limit:
         return depths
-    groups = (depths[count * k // most : count * (k + 1) // most] for k in range(most))
+    groups = (depths[count * k // limit : count * (k + 1) // limit] for k in range(limit))
     return [sum(group) / len(group) for group in groups]
 
 

@@ -20,15 +20,10 @@ _DOUBLE = 2.0  # time of complex128 over that of complex64
 _TIGHT = 1e-7  # tolerance of the reference of refocusing
 
 
-def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Comparison:
+def hologram_error(experiment: VolumeExperiment) -> Comparison:
     """Error of the colour with the largest predicted error, for the light of its brightest planes.
 
     Their hologram by the method of the plan is compared with a convolution of each plane in complex128.
-
-    Args:
-        experiment: The experiment.
-        limit: Seconds that a reference may take on the reference machine of ``planning.machine``; since it is not this
-            machine, the same is measured everywhere.
     """
     colour = max(range(len(experiment.plans)), key=lambda c: experiment.plans[c].predicted_error)
     plan, wavelength = experiment.plans[colour], experiment.settings.wavelengths[colour]
@@ -43,7 +38,7 @@ def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Compar
         return rendering_seconds(experiment, machine) + FLOP_SECONDS * flops * machine.fft(math.prod(plan.size))
 
     count = min(_PLANES, len(experiment.depths))
-    while count and seconds(Machine(), count) > limit:
+    while count and seconds(Machine(), count) > LIMIT:
         count -= 1
     if not count:
         return not_measured(HOLOGRAM, plan.predicted_error, seconds(machine_speed(experiment.device), 1))
@@ -59,7 +54,7 @@ def hologram_error(experiment: VolumeExperiment, limit: float = LIMIT) -> Compar
     return Comparison(HOLOGRAM, plan.predicted_error, relative_error(*fields), note)
 
 
-def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: float, limit: float = LIMIT) -> Comparison:
+def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: float) -> Comparison:
     """Error of refocusing the middle colour of ``hologram`` [C, H, W] at a depth in metres.
 
     The reference is propagated in complex128 within the smallest tolerance that some method reaches.
@@ -71,18 +66,18 @@ def refocusing_error(experiment: VolumeExperiment, hologram: Tensor, depth: floa
     predicted = plan_propagation(*scene, tolerance=tolerance, dtype=experiment.dtype).predicted_error
     plan = plan_propagation(*scene, tolerance=_TIGHT, dtype=torch.complex128)
     if plan.predicted_error > predicted / 2:
-        words = f"not measured: the most exact method itself is predicted to err by {plan.predicted_error:.1e}"
-        return Comparison(REFOCUSING, predicted, None, words)
+        note = f"not measured: the most exact method itself is predicted to err by {plan.predicted_error:.1e}"
+        return Comparison(REFOCUSING, predicted, None, note)
     seconds = _DOUBLE * FLOP_SECONDS * plan.flops
-    if seconds > limit:
+    if seconds > LIMIT:
         speed = machine_speed(experiment.device).fft(math.prod(plan.padded))
         return not_measured(REFOCUSING, predicted, seconds * speed)
     setup = experiment.grid, wavelength, depth
     with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the note states the error
         exact = refocused(hologram[middle].to(torch.complex128), *setup, tolerance=_TIGHT)
     error = relative_error(refocused(hologram[middle].to(experiment.dtype), *setup, tolerance=tolerance), exact)
-    words = f"{wavelength * 1e9:.0f} nm at {depth * 1e3:.4g} mm, against complex128 within {plan.predicted_error:.0e}"
-    return Comparison(REFOCUSING, predicted, error, words)
+    note = f"{wavelength * 1e9:.0f} nm at {depth * 1e3:.4g} mm, against complex128 within {plan.predicted_error:.0e}"
+    return Comparison(REFOCUSING, predicted, error, note)
 
 
 def _brightest(experiment: VolumeExperiment, colour: int, count: int) -> list[tuple[int, Tensor]]:
@@ -92,8 +87,8 @@ def _brightest(experiment: VolumeExperiment, colour: int, count: int) -> list[tu
         for j, plane in enumerate(experiment.layers().amplitudes()):
             light = plane[colour].abs().square().sum().item()
             if len(kept) < count or light > kept[-1][0]:
-                kept = sorted([*kept, (light, j, plane[colour].clone())], key=lambda each: -each[0])[:count]
-    return [(j, plane) for _, j, plane in sorted(kept, key=lambda each: each[1])]
+                kept = sorted([*kept, (light, j, plane[colour].clone())], key=lambda candidate: -candidate[0])[:count]
+    return [(j, plane) for _, j, plane in sorted(kept, key=lambda candidate: candidate[1])]
 
 
 def relative_error(field: Tensor, exact: Tensor) -> float:

@@ -24,10 +24,8 @@ _RAY_BYTES = 120  # memory of the renderer per ray
 _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
-_LIT, _DARK = (
-    0.05,
-    0.1,
-)  # value above which a ray is not black, and share of such rays below which a picture counts as mostly black
+_LIT = 0.05  # value above which a ray is not black
+_DARK = 0.1  # share of such rays below which a picture counts as mostly black
 
 
 def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
@@ -38,7 +36,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
     seconds = {"holograms": settings.report.seeds * hologram_seconds(experiment, machine)}
     seconds |= _evaluation_seconds(experiment, machine)
     slab_error = experiment.sampler().slab_error(experiment.volume)
-    spectra = [experiment.dtype.itemsize * math.prod(each.size) for each in plans]  # bytes
+    spectra = [experiment.dtype.itemsize * math.prod(plan.size) for plan in plans]  # bytes
     # While planes are added, each colour holds a sum and a summand; at the end, one spectrum is transformed as well.
     slab = 8 * rays * _SLAB * len(plans)
     peak = _BASE_BYTES + 2 * sum(spectra) + 1.5 * max(spectra) + slab + _RAY_BYTES * rays
@@ -83,7 +81,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
 def hologram_seconds(experiment: VolumeExperiment, machine: Machine) -> float:
     """Seconds to render and compute the holograms of one realisation."""
     seconds = rendering_seconds(experiment, machine)
-    return seconds + sum(FLOP_SECONDS * each.flops * machine.fft(math.prod(each.size)) for each in experiment.plans)
+    return seconds + sum(FLOP_SECONDS * plan.flops * machine.fft(math.prod(plan.size)) for plan in experiment.plans)
 
 
 def rendering_seconds(experiment: VolumeExperiment, machine: Machine) -> float:
@@ -124,10 +122,10 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         divided = "pixels, rays, distances, width and a given number of planes"
         lines.append(f"Scale      1 / {settings.scale} of the configuration: {divided} are divided by {settings.scale}")
     lines += colours_in_words(settings.wavelengths)
-    for each in values["holograms"]:
-        method = each["method"] + (f", {each['cone']} cone of light" if each["near"] else "")
-        error = f"predicted error {each['predicted_error']:.1e}"
-        lines.append(f"{each['wavelength_nm']:.0f} nm     method: {method} ({error}); {each['runner_up']}")
+    for hologram in values["holograms"]:
+        method = hologram["method"] + (f", {hologram['cone']} cone of light" if hologram["near"] else "")
+        error = f"predicted error {hologram['predicted_error']:.1e}"
+        lines.append(f"{hologram['wavelength_nm']:.0f} nm     method: {method} ({error}); {hologram['runner_up']}")
     lines += [
         experiment.budget.text,
         f"Precision  {values['precision']}",
@@ -136,7 +134,7 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     lines += [f"Note       {note}" for note in values["notes"]]
-    lines += [f"WARNING    {words}" for words in values["warnings"]]
+    lines += [f"WARNING    {warning}" for warning in values["warnings"]]
     return "\n".join(lines)
 
 
@@ -182,7 +180,7 @@ def preset_note(experiment: VolumeExperiment) -> str:
 
 
 def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
-    notes = list(dict.fromkeys(note for each in experiment.plans for note in each.notes))
+    notes = list(dict.fromkeys(note for plan in experiment.plans for note in plan.notes))
     if slab_error > _COARSE_SLABS:
         notes.append(
             f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: more planes "

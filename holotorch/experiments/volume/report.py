@@ -28,14 +28,14 @@ def volume_section(record: RunRecord) -> list[str]:
     parts.append("</div>")
     if source := record.picture("depth"):
         parts.append(figure(source, "Mean depth along each ray", "wide"))
-    parts += [element("p", f"Warning: {words}.", "warn") for words in plan.get("warnings", [])]
+    parts += [element("p", f"Warning: {warning}.", "warn") for warning in plan.get("warnings", [])]
     parts += [_scores(summary, depths), element("p", _cost(summary))]
-    if words := error_sentence(summary):
-        parts.append(element("p", words))
+    if sentence := error_sentence(summary):
+        parts.append(element("p", sentence))
     rows = [
         [name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "warnings", "holograms")
     ]
-    rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
+    rows += [[f"{hologram['wavelength_nm']:.0f} nm", plain(hologram)] for hologram in plan["holograms"]]
     parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
     return parts + [element("p", note, "warn") for note in plan["notes"]]
 
@@ -51,8 +51,8 @@ def _scores(summary: dict[str, Any], depths: list[float]) -> str:
         scores.insert(0, f"SSIM between the picture in focus and the rendering {summary['ssim_in_focus']:.3f}")
     if summary["speckle_contrast"] is not None:
         scores.append(f"speckle contrast {summary['speckle_contrast']:.2f}")
-    words = f"{'; '.join(scores)}. Relative error of each part of the scene, by focus:"
-    return element("p", words) + table(names, rows)
+    caption = f"{'; '.join(scores)}. Relative error of each part of the scene, by focus:"
+    return element("p", caption) + table(names, rows)
 
 
 def _cost(summary: dict[str, Any]) -> str:

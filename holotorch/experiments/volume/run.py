@@ -18,7 +18,7 @@ from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.pictures import in_colour, save_picture
 from holotorch.experiments.runs.processes import added, from_first, process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
-from holotorch.experiments.runs.signals import Pressed, deferred
+from holotorch.experiments.runs.signals import Signals, deferred
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import VolumeEvaluation
@@ -30,7 +30,7 @@ from holotorch.io.files import save_array, write_bytes, write_json
 def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
     """Compute the realisations, or this process's part of each, and fill the folder; True if the run is complete."""
     rank, count = process_count()
-    planes, seeds, pressed = len(experiment.depths), experiment.settings.report.seeds, opened.pressed
+    planes, seeds, signals = len(experiment.depths), experiment.settings.report.seeds, opened.signals
     state = _State(opened.path, experiment) if rank == 0 else None  # only the first process has results
     (start,) = from_first([state.evaluation.count if state else 0])
     part = Part(rank, count, planes, len(experiment.settings.wavelengths)) if count > 1 else None
@@ -49,18 +49,18 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
                 hologram = added(hologram)
                 seconds = time.perf_counter() - started
                 if state:
-                    with deferred(pressed):
+                    with deferred(signals):
                         state.add(hologram, seed, seconds, rendering)
-                    if pressed:
+                    if signals:
                         break
         except KeyboardInterrupt:
             pass
         if not state:
-            return not pressed
+            return not signals
         if not state.evaluation.count:
             raise KeyboardInterrupt
-        errors = _errors(experiment, state, pressed)
-        with deferred(pressed):
+        errors = _errors(experiment, state, signals)
+        with deferred(signals):
             return _write(opened, experiment, state, errors)
 
 
@@ -111,9 +111,9 @@ class _State:
         self.checkpoint.save({"sums": self.evaluation.sums, "count": self.evaluation.count, "rows": self.rows})
 
 
-def _errors(experiment: VolumeExperiment, state: _State, pressed: Pressed) -> dict[str, Any] | None:
+def _errors(experiment: VolumeExperiment, state: _State, signals: Signals) -> dict[str, Any] | None:
     """Predicted and measured errors of all realisations, for the summary; None after an interruption."""
-    if pressed or state.evaluation.count < experiment.settings.report.seeds:
+    if signals or state.evaluation.count < experiment.settings.report.seeds:
         return None
     hologram = torch.from_numpy(np.load(state.out / "arrays" / "hologram.npy")).to(experiment.device)
     depths = state.evaluation.depths

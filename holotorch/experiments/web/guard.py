@@ -45,8 +45,8 @@ def check_host(request: web.BaseRequest, refusal: str) -> None:
 
 def check_origin(request: web.BaseRequest, refusal: str) -> None:
     """Raise HTTPForbidden with the text ``refusal`` if a page of another site sends the request."""
-    own = f"{request.scheme}://{request.headers.get('Host', '')}"
-    if request.headers.get("Origin", own) != own:
+    expected = f"{request.scheme}://{request.headers.get('Host', '')}"
+    if request.headers.get("Origin", expected) != expected:
         raise web.HTTPForbidden(text=refusal)
 
 

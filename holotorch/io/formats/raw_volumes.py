@@ -70,8 +70,8 @@ def read_metaimage(path: Path) -> Scan:
         raise ValueError(f"{path} has ElementType = {kind}; known are {', '.join(_META_TYPES)}")
     big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
     dtype = np.dtype((">" if big else "<") + _META_TYPES[kind])
-    shape = _whole(fields, "DimSize", 3, path, least=1)[::-1]
-    skip = _whole(fields, "HeaderSize", 1, path, least=-1, default="0")[0]
+    shape = _whole(fields, "DimSize", 3, path, minimum=1)[::-1]
+    skip = _whole(fields, "HeaderSize", 1, path, minimum=-1, default="0")[0]
     offset = end if name == "LOCAL" else skip
     if fields.get("CompressedData", "False").lower() == "true":
         values = scan.unpacked(data, unzipped(data, scan.stated_bytes(data, shape, dtype), offset), shape, dtype)
@@ -174,12 +174,12 @@ def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
 
 
 def _whole(
-    fields: dict[str, str], name: str, count: int, path: Path, *, least: int, default: str | None = None
+    fields: dict[str, str], name: str, count: int, path: Path, *, minimum: int, default: str | None = None
 ) -> list[int]:
-    """The ``count`` whole numbers, each at least ``least``, in the field ``name`` or in the text ``default``."""
+    """The ``count`` whole numbers, each at least ``minimum``, in the field ``name`` or in the text ``default``."""
     numbers = _numbers(fields, (name,), count, path, default)
-    if not all(number.is_integer() and number >= least for number in numbers):
-        raise ValueError(f"{path} must give whole numbers of at least {least} as {name}, got {fields[name]!r}")
+    if not all(number.is_integer() and number >= minimum for number in numbers):
+        raise ValueError(f"{path} must give whole numbers of at least {minimum} as {name}, got {fields[name]!r}")
     return [int(number) for number in numbers]
 
 

@@ -120,13 +120,13 @@ def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) 
     sizes = " x ".join(map(str, shape))
     if any(size < 1 for size in shape):
         raise ValueError(f"{path} states {sizes} voxels (D x H x W); every size must be above 0")
-    wanted = math.prod(shape) * dtype.itemsize
-    if found != wanted:
+    expected = math.prod(shape) * dtype.itemsize
+    if found != expected:
         raise ValueError(
-            f"{path}: expected {wanted} bytes = {sizes} (D x H x W) of {dtype.name}, found {found}; check shape and "
+            f"{path}: expected {expected} bytes = {sizes} (D x H x W) of {dtype.name}, found {found}; check shape and "
             "dtype, or the file is truncated"
         )
-    return wanted
+    return expected
 
 
 def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int | None = 0) -> np.ndarray:

@@ -126,8 +126,8 @@ def _tiff_pages(path: Path) -> int:
 
     def first_value(directory: int, tag: int) -> int:
         """First value of the entry ``tag`` of the directory at byte ``directory``; 1 without this entry."""
-        begin = directory + counter
-        for position in range(begin, begin + entry * number(directory, counter), entry):
+        start = directory + counter
+        for position in range(start, start + entry * number(directory, counter), entry):
             if number(position, 2) == tag:
                 size = {3: 2, 4: 4, 16: 8}.get(number(position + 2, 2), 1)  # bytes per value, by TIFF type
                 count, value = number(position + 4, length), position + 4 + length

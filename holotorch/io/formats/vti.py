@@ -78,8 +78,8 @@ def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[
         arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
         if holder is not None and arrays and (member is None or member in arrays or cells):
             active = holder.get("Scalars")
-            wanted = member or (active if active in arrays else None)
-            return arrays[scan.chosen(list(arrays), wanted, path)], cells
+            chosen = member or (active if active in arrays else None)
+            return arrays[scan.chosen(list(arrays), chosen, path)], cells
     raise ValueError(f"{path} holds no array{f' {member!r}' if member else ''}")
 
 

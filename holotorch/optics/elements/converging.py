@@ -14,7 +14,7 @@ from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE, FOCAL_LENGTH, WAVELENGTH
 from holotorch.optics.elements.lens_response import lens_matrices
 from holotorch.optics.free_space.impulse_response import fresnel_taps, tap_indices
-from holotorch.optics.free_space.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.kernels import carrier, cycles_phasor
 
 _TRUSTED = 0.1  # rad: a warning is emitted if the paraxial model neglects a larger phase
 
@@ -214,7 +214,7 @@ class ConvergingFresnel(FieldOperator):
     def _curvature(self, axis: int, wavelength: Tensor) -> Tensor:
         """exp(-i pi x^2 / (wavelength (focus - distance))) on the samples of the result, complex128 [C, n']."""
         position = self.out_grid.coordinates()[axis].reshape(-1) + self.offset[axis]
-        return turns_phasor(-position.square() / (2 * wavelength[:, None] * (self.focus - self.distance)))
+        return cycles_phasor(-position.square() / (2 * wavelength[:, None] * (self.focus - self.distance)))
 
     def _neglected_phase(self) -> float:
         phases = [0.0]
@@ -235,10 +235,10 @@ class ConvergingFresnel(FieldOperator):
         low, high = self.offset[axis] - half_out, self.offset[axis] + half_out
         slopes = []
         for q in (-half, half):
-            begin, end = max(low, m * q - spread), min(high, m * q + spread)
-            slopes += [abs(begin - q), abs(end - q)] if begin <= end else []
+            start, end = max(low, m * q - spread), min(high, m * q + spread)
+            slopes += [abs(start - q), abs(end - q)] if start <= end else []
         for x in (low, high) if m else ():
             first, last = sorted(((x - spread) / m, (x + spread) / m))
-            begin, end = max(-half, first), min(half, last)
-            slopes += [abs(x - begin), abs(x - end)] if begin <= end else []
+            start, end = max(-half, first), min(half, last)
+            slopes += [abs(x - start), abs(x - end)] if start <= end else []
         return max(slopes) / abs(self.distance) if slopes else None

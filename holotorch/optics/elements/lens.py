@@ -13,7 +13,7 @@ from holotorch.core.grid import Grid
 from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, SOFTNESS, WAVELENGTH
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 
 
 def lens_phase(
@@ -156,9 +156,9 @@ class Lens(Transmission):
         numbers = focal_length.detach().tolist() if isinstance(focal_length, Tensor) else focal_length
         given = list(numbers) if isinstance(numbers, Sequence) else [numbers] * len(wavelengths)
         if len(given) != len(wavelengths):
-            wanted = f"one number or one per wavelength ({len(wavelengths)})"
-            raise ValueError(f"focal_length must be {wanted}, got {len(given)}")
-        lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
+            expected = f"one number or one per wavelength ({len(wavelengths)})"
+            raise ValueError(f"focal_length must be {expected}, got {len(given)}")
+        lengths = [checks.quantity(FOCAL_LENGTH, length) for length in given]
         edge = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
         affordable("a lens", grid, len(wavelengths))
         super().__init__(grid, wavelengths, None)
@@ -175,7 +175,7 @@ class Lens(Transmission):
         """Transmission for the present focal length, complex128 [C, H, W]."""
         length = torch.as_tensor(self.focal_length, dtype=torch.float64)
         wavelength = torch.tensor(self.wavelengths, dtype=torch.float64, device=length.device)
-        values = turns_phasor(_phase_cycles(self.grid, wavelength, length, self.paraxial))
+        values = cycles_phasor(_phase_cycles(self.grid, wavelength, length, self.paraxial))
         return values if self.radius is None else values * pupil(self.grid, self.radius).to(length.device)
 
     def extra_repr(self) -> str:

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.special import chirped_fresnel_integral
-from holotorch.optics.free_space.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.kernels import carrier, cycles_phasor
 
 _CHUNK = 50_000  # weights computed at a time, each by a quadrature with 42 nodes
 
@@ -67,13 +67,13 @@ def _weights(x: Tensor, q: Tensor, pitch: float, wavelength: Tensor, distance: T
     inverted = (m < 0).to(torch.float64)
     sign_z_over_m = torch.sign(distance) * (1 - 2 * inverted)
     scale = torch.sqrt(2 * (product / size).abs())
-    chirp = turns_phasor(((x - q).square() / distance - q.square() / focus) / (2 * wavelength))
+    chirp = cycles_phasor(((x - q).square() / distance - q.square() / focus) / (2 * wavelength))
     total = torch.zeros_like(chirp)
     for sign in (1, -1):
         # exp(-+i pi u^2 / 2) times the chirp: the contribution of one end of the band.
         from_edge = edge - sign * x / product
         cycles = x.square() / (2 * product) - product / (2 * size) * from_edge.square() - sign * edge * q
-        band_end = turns_phasor(cycles)
+        band_end = cycles_phasor(cycles)
         u = scale * (edge - sign * (x - m * q) / product)
         # A position on the step, such as the outermost sample of an even DFT, counts as exactly on it despite rounding.
         u = torch.where(sharp & (from_edge.abs() <= 1e-12 * edge), 0.0, u)

@@ -28,12 +28,12 @@ class DepthStack(nn.Module):
         super().__init__()
         if not filters:
             raise ValueError("DepthStack needs at least one propagator")
-        if not all(isinstance(each, SpectralFilter) for each in filters):
+        if not all(isinstance(operator, SpectralFilter) for operator in filters):
             raise TypeError("DepthStack needs propagators that are filters in frequency, such as Fresnel")
         first = filters[0]
         if first.out_grid != first.grid:
             raise ValueError("DepthStack needs propagators whose result has the grid of the field")
-        if len({(each.grid, each.out_grid, each.wavelengths, each.padded) for each in filters}) > 1:
+        if len({(operator.grid, operator.out_grid, operator.wavelengths, operator.padded) for operator in filters}) > 1:
             raise ValueError("DepthStack needs propagators of one grid, one set of wavelengths and one padded size")
         self.filters = nn.ModuleList(filters)
         self.grid, self.wavelengths = first.grid, first.wavelengths
@@ -41,7 +41,7 @@ class DepthStack(nn.Module):
     def forward(self, field: Tensor) -> Tensor:
         """Propagate ``field`` [..., C, H, W] to all depths, [..., C, D, H, W], same dtype."""
         checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
-        kernels = [each.kernel_for(field) for each in self._filters()]
+        kernels = [operator.kernel_for(field) for operator in self._filters()]
         spectrum = fft2(field, (kernels[0].shape[-2], kernels[0].shape[-1]))
         return torch.stack([ifft2(spectrum * kernel, self.grid.shape) for kernel in kernels], -3)
 
@@ -51,7 +51,7 @@ class DepthStack(nn.Module):
         if tuple(field.shape[-4:]) != expected:
             raise ValueError(f"field must end in (C, D, H, W) = {expected}, got {tuple(field.shape)}")
         parts = zip(self._filters(), field.unbind(-3), strict=True)
-        return torch.stack([each.adjoint(part) for each, part in parts]).sum(0)
+        return torch.stack([operator.adjoint(part) for operator, part in parts]).sum(0)
 
     def _filters(self) -> list[SpectralFilter]:
         return [each for each in self.filters if isinstance(each, SpectralFilter)]  # typed, unlike a ModuleList

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.special import chirped_fresnel_integral
-from holotorch.optics.free_space.kernels import direction_cosine, turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor, direction_cosine
 
 
 def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distance: Tensor) -> Tensor:
@@ -31,11 +31,11 @@ def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distanc
     displacement = displacement.to(torch.float64)
     x, edge = displacement * pitch, 0.5 / pitch
     scale = torch.sqrt(2 * product)
-    chirp = turns_phasor(x.square() / (2 * product))
+    chirp = cycles_phasor(x.square() / (2 * product))
     total = torch.zeros_like(chirp)
     for sign in (1, -1):
         # exp(-i pi u^2 / 2) times the chirp is the integrand at one end of the band.
-        band_end = turns_phasor(-product * edge**2 / 2 + sign * displacement / 2)
+        band_end = cycles_phasor(-product * edge**2 / 2 + sign * displacement / 2)
         u = scale * (edge - sign * x / product)
         total = total + chirped_fresnel_integral(u, chirp, band_end)
     taps = total * pitch / scale
@@ -58,13 +58,13 @@ def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tenso
     It is the exact transfer function divided by the paraxial one; s and cos are the sine and cosine of the angle to the
     axis. The frequencies in cycles per metre broadcast against wavelength and distance in metres. Evanescent waves
     decay with abs(distance); their phase is such that the product with the paraxial factor and the carrier is real.
-    :func:`tilted_turns` is the counterpart for a tilted carrier.
+    :func:`tilted_cycles` is the counterpart for a tilted carrier.
     """
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     travels = sine2 < 1
     cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
     cycles = -distance / wavelength * torch.where(travels, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
-    phase = turns_phasor(cycles)
+    phase = cycles_phasor(cycles)
     # Without evanescent waves there is no decay.
     if checks.readable(sine2) and not bool((sine2 > 1).any()):
         return phase
@@ -72,7 +72,7 @@ def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tenso
     return phase * torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary)
 
 
-def tilted_turns(
+def tilted_cycles(
     fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tensor, tilt: Tensor, *, squares: bool = True
 ) -> Tensor:
     """Phase in cycles that free space adds to frequencies (fy, fx) about a carrier with the sines ``tilt`` (y, x) [2].
@@ -107,5 +107,5 @@ def levelling_shift(
     cycles = []
     for sign in (1, -1):
         ends[axis] = torch.full((), sign * nyquist[axis], dtype=torch.float64, device=tilt.device)
-        cycles.append(tilted_turns(ends[0], ends[1], wavelength, distance, tilt, squares=False))
+        cycles.append(tilted_cycles(ends[0], ends[1], wavelength, distance, tilt, squares=False))
     return (cycles[0] - cycles[1]) / (2 * nyquist[axis])

@@ -22,7 +22,7 @@ def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
     """
     cycles = _float64(DISTANCE, distance) / _float64(WAVELENGTH, wavelength)
     checks.precise(wavelength, distance)
-    return turns_phasor(cycles)
+    return cycles_phasor(cycles)
 
 
 def angular_spectrum_kernel(
@@ -51,7 +51,7 @@ def angular_spectrum_kernel(
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     cosine, imaginary = direction_cosine(sine2)
     cycles = -distance / wavelength * torch.where(sine2 < 1, sine2 / (1 + cosine), 1)
-    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(cycles)
+    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * cycles_phasor(cycles)
     if not band_limit:
         return kernel
     # tan(angle) = wavelength f / cos. The same limit drops evanescent waves next to the cut-off, which decay
@@ -80,13 +80,13 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     """
     product = (_float64(WAVELENGTH, wavelength) * _float64(DISTANCE, distance))[..., None, None]
     fy, fx = grid.frequencies(product.device)
-    return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
+    return cycles_phasor(-product / 2 * fy.square()) * cycles_phasor(-product / 2 * fx.square())
 
 
-def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *, paraxial: bool = False) -> Tensor:
+def window_taper(grid: Grid, wavelength: float, distance: float, shift: Pair, *, paraxial: bool = False) -> Tensor:
     """Weights, float64 [H, W] in FFT order, that remove light which would wrap around into a window.
 
-    Light that moves sideways by at most ``reach`` keeps weight 1. Light that moves by the padded extent minus ``reach``
+    Light that moves sideways by at most ``shift`` keeps weight 1. Light that moves by the padded extent minus ``shift``
     or more re-enters the window and gets weight 0; between the two limits the weight falls as cos^2. A step would
     diffract light over the window: 10 % of the intensity for a hologram of random phase. A transition that is
     2 sqrt(wavelength distance) wide reduces this to 1e-4.
@@ -95,15 +95,15 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
         grid: Sampling of the padded field.
         wavelength: In metres.
         distance: In metres.
-        reach: Half the extent of the window plus half the extent of the field, in metres (y, x).
+        shift: Half the extent of the window plus half the extent of the field, in metres (y, x).
         paraxial: Light moves sideways by distance times the sine of its angle, as in the Fresnel model.
 
-    Raises ValueError for a padded extent below twice ``reach``.
+    Raises ValueError for a padded extent below twice ``shift``.
     """
     weights = torch.ones((), dtype=torch.float64)
-    sines = [wavelength * each for each in grid.frequencies()]
+    sines = [wavelength * frequency for frequency in grid.frequencies()]
     steepest = [wavelength * (size // 2) / (size * pitch) for size, pitch in zip(grid.shape, grid.pitch, strict=True)]
-    for axis, (extent, start, size) in enumerate(zip(grid.extent, reach, grid.shape, strict=True)):
+    for axis, (extent, start, size) in enumerate(zip(grid.extent, shift, grid.shape, strict=True)):
         if size == 1:
             continue
         sine, other = sines[axis], sines[1 - axis].square()
@@ -118,7 +118,7 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
     return weights
 
 
-def turns_phasor(cycles: Tensor) -> Tensor:
+def cycles_phasor(cycles: Tensor) -> Tensor:
     """exp(2 pi i cycles), with whole cycles subtracted in float64; the gradient is that of the unreduced phase."""
     return phasor(2 * math.pi * (cycles - cycles.detach().round()))
 

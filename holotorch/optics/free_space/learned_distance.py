@@ -72,7 +72,7 @@ class _TimesLearned(torch.autograd.Function):
         axes = list(zip(padded.shape, padded.pitch, sampled, strict=True))
         factors = [_axis_factor(*axis, wavelengths, z) for axis in (axes if axes[0] != axes[1] else axes[:1])]
         rows = torch.from_numpy(factors[-1]).to(spectrum.dtype)
-        lines = factors[0] * _turns(z / wavelengths)[:, None]
+        lines = factors[0] * _cycles_phasor(z / wavelengths)[:, None]
         lines[1] += 2j * math.pi / wavelengths[:, None] * lines[0]  # the derivative of the carrier
         columns = torch.from_numpy(lines).to(spectrum.dtype)
         quadrants = columns[:, :, :, None] * rows[0, :, None, :]  # of the function and of its derivative
@@ -107,7 +107,7 @@ def _axis_factor(size: int, pitch: float, sampled: bool, wavelength: Array, dist
     index = np.arange(size // 2 + 1, dtype=np.float64)
     if sampled:
         curvature = -wavelength[:, None] / 2 * np.square(index / (size * pitch))
-        factor = _turns(distance * curvature)
+        factor = _cycles_phasor(distance * curvature)
         return np.stack([factor, 2j * math.pi * curvature * factor])
     taps = _taps_and_slopes(index, wavelength[:, None] * (abs(distance) / pitch**2))
     # From the derivative in a = wavelength |z| / pitch^2 to that in z.
@@ -131,7 +131,7 @@ def _taps_and_slopes(index: Array, a: Array) -> Array:
 
     scale = np.sqrt(2 * a)
     curvature = np.square(index) / a
-    chirp, end = _turns(curvature / 2), _turns(-a / 8) * (1 - 2 * (index % 2))
+    chirp, end = _cycles_phasor(curvature / 2), _cycles_phasor(-a / 8) * (1 - 2 * (index % 2))
     shift = index * (2 / scale)
     u = np.stack([scale / 2 - shift, scale / 2 + shift])
     ends = np.sign(u) * (chirp - end * wofz((1j - 1) * math.sqrt(math.pi) / 2 * np.abs(u)))
@@ -140,7 +140,7 @@ def _taps_and_slopes(index: Array, a: Array) -> Array:
     return np.stack([taps, slopes])
 
 
-def _turns(cycles: Array) -> Array:
+def _cycles_phasor(cycles: Array) -> Array:
     """exp(2 pi i cycles); whole cycles are subtracted first."""
     return np.exp(2j * math.pi * (cycles - np.round(cycles)))
 

@@ -12,7 +12,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 
 _CHUNK = 4_000_000  # kernel values at a time: 64 MB of complex128
 
@@ -67,10 +67,10 @@ class RayleighSommerfeld(FieldOperator):
 
     def _adjoint(self, field: Tensor) -> Tensor:
         flat = field.to(torch.complex128).flatten(-2)
-        total, begin = torch.zeros(1, dtype=torch.complex128, device=field.device), 0
+        total, start = torch.zeros(1, dtype=torch.complex128, device=field.device), 0
         for kernel in self._kernels(field.device):
-            part = flat[..., begin : begin + kernel.shape[1]]
-            total, begin = total + torch.einsum("...cp,cpq->...cq", part, kernel.conj()), begin + kernel.shape[1]
+            part = flat[..., start : start + kernel.shape[1]]
+            total, start = total + torch.einsum("...cp,cpq->...cq", part, kernel.conj()), start + kernel.shape[1]
         return total.unflatten(-1, self.grid.shape).to(field.dtype)
 
     def _kernels(self, device: torch.device) -> Iterator[Tensor]:
@@ -84,7 +84,7 @@ class RayleighSommerfeld(FieldOperator):
             dy, dx = chunk[:, 0, None, None] - y, chunk[:, 1, None, None] - x
             r = torch.sqrt(dy.square() + dx.square() + z * z).flatten(1)
             weight = area * z / (2 * math.pi * r.square())
-            phasor = turns_phasor(r / wavelengths)
+            phasor = cycles_phasor(r / wavelengths)
             factor = torch.complex(1 / r.expand(phasor.shape), -2 * math.pi / wavelengths.expand(phasor.shape))
             kernel = weight * factor * phasor
             yield kernel if self.distance > 0 else kernel.conj()

@@ -11,8 +11,8 @@ from holotorch.core.fourier import fft2, ifft2, multiplied
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE
-from holotorch.optics.free_space.impulse_response import fresnel_taps, levelling_shift, remainder_kernel, tilted_turns
-from holotorch.optics.free_space.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.impulse_response import fresnel_taps, levelling_shift, remainder_kernel, tilted_cycles
+from holotorch.optics.free_space.kernels import carrier, cycles_phasor
 from holotorch.optics.free_space.padding import FINEST, resampled_padding
 from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 
@@ -68,9 +68,9 @@ def resampling_factors(
         fy, fx = Grid(padded, planes.grid.pitch).frequencies(distance.device)
         wavelength, distance = wavelength[..., None, None], distance[..., None, None]
         if any(planes.tilt):
-            cycles = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
+            cycles = tilted_cycles(fy, fx, wavelength, distance, tilt, squares=False)
             cycles = cycles - fy * shifts[0][..., None, None] - fx * shifts[1][..., None, None]
-            remainder = turns_phasor(cycles).to(dtype)
+            remainder = cycles_phasor(cycles).to(dtype)
         else:
             remainder = remainder_kernel(fy, fx, wavelength, distance).to(dtype)
     return columns.to(dtype), matrices[1].to(dtype), remainder

@@ -15,9 +15,9 @@ from holotorch.optics.free_space.impulse_response import (
     levelling_shift,
     remainder_kernel,
     tap_indices,
-    tilted_turns,
+    tilted_cycles,
 )
-from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, turns_phasor
+from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, cycles_phasor
 from holotorch.optics.free_space.learned_distance import has_closed_form, times_learned
 from holotorch.optics.free_space.plane_pair import PlanePair, shifts
 
@@ -58,10 +58,10 @@ def transfer_function(
     carrier_factor = carrier(wavelength, distance * torch.sqrt(cosine2)).to(dtype)
     if tilted and all(sampled):
         fy, fx = padded.frequencies(distance.device)
-        cycles = tilted_turns(fy, fx, wavelength[..., None, None], distance[..., None, None], tilt)
+        cycles = tilted_cycles(fy, fx, wavelength[..., None, None], distance[..., None, None], tilt)
         for frequency, pitch, position in zip((fy, fx), padded.pitch, positions, strict=True):
             cycles = cycles + frequency * pitch * position[..., None, None]
-        return turns_phasor(cycles).to(dtype) * carrier_factor[..., None, None]
+        return cycles_phasor(cycles).to(dtype) * carrier_factor[..., None, None]
     shifts_beyond = []  # of each axis, in samples: the part of the shift that moves into the taps
     if tilted:
         nyquist = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
@@ -84,10 +84,10 @@ def transfer_function(
     wavelength, distance = wavelength[..., None, None], distance[..., None, None]
     if tilted:
         fy, fx = padded.frequencies(distance.device)
-        cycles = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
+        cycles = tilted_cycles(fy, fx, wavelength, distance, tilt, squares=False)
         for frequency, pitch, shift in zip((fy, fx), padded.pitch, shifts_beyond, strict=True):
             cycles = cycles - frequency * pitch * shift[..., None, None]
-        return kernel * turns_phasor(cycles).to(dtype)
+        return kernel * cycles_phasor(cycles).to(dtype)
     # The factor beyond Fresnel is even in both frequencies, so that one quadrant determines it.
     (height, width), (py, px) = padded.shape, padded.pitch
     fy = torch.arange(height // 2 + 1, dtype=torch.float64, device=distance.device)[:, None] / (height * py)
@@ -131,7 +131,7 @@ def wide_transfer_function(
     positions = shifts(planes, distance, no_tilt)
     for frequency, pitch, position in zip(padded.frequencies(distance.device), padded.pitch, positions, strict=True):
         if bool((position != 0).any()):
-            kernel = kernel * turns_phasor(frequency * pitch * position[..., None, None])
+            kernel = kernel * cycles_phasor(frequency * pitch * position[..., None, None])
     return kernel.to(dtype)
 
 
@@ -143,7 +143,7 @@ def _axis_factor(
     if sampled:
         frequency = torch.fft.fftfreq(size, pitch, dtype=torch.float64, device=distance.device)
         cycles = -(wavelength * distance)[..., None] / 2 * frequency.square()
-        return turns_phasor(cycles + frequency * pitch * position[..., None])
+        return cycles_phasor(cycles + frequency * pitch * position[..., None])
     index = tap_indices(size, planes.grid.shape[axis], planes.out.shape[axis]).to(distance.device)
     positions = index + position[..., None]
     at_zero = (distance == 0)[..., None]

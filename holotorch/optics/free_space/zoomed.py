@@ -9,7 +9,7 @@ from torch import Tensor
 from holotorch.core.fourier import fft, fft2, good_length, ifft2, ifft_unscaled, multiplied
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import FieldOperator, Wavelengths
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 
 Chirp = tuple[Tensor, Tensor, Tensor]
 
@@ -30,9 +30,9 @@ def chirp(size: int, step: float, start: float, count: int, device: torch.device
     # Differences j - k in FFT order: from 0 to the largest, then from the most negative to -1.
     between = torch.where(between >= count + size // 2, between - length, between)
     rate = step / size
-    pre_chirp = turns_phasor(rate / 2 * index.square() + index * (start / size))
-    post_chirp = turns_phasor(rate / 2 * target.square()) / size
-    return pre_chirp, torch.fft.fft(turns_phasor(-rate / 2 * between.square())) / length, post_chirp
+    pre_chirp = cycles_phasor(rate / 2 * index.square() + index * (start / size))
+    post_chirp = cycles_phasor(rate / 2 * target.square()) / size
+    return pre_chirp, torch.fft.fft(cycles_phasor(-rate / 2 * between.square())) / length, post_chirp
 
 
 def zoom(spectrum: Tensor, factors: Chirp) -> Tensor:

@@ -12,37 +12,38 @@ from torch.utils.checkpoint import checkpoint
 from holotorch.core import checks
 from holotorch.core.grid import Grid, Pair
 
-Place = TypeVar("Place")
+Argument = TypeVar("Argument")
 
 
 def incoherent_sum(
-    intensity_of: Callable[[Place], Tensor],
-    places: Iterable[Place] | Tensor,
+    intensity_of: Callable[[Argument], Tensor],
+    arguments: Iterable[Argument] | Tensor,
     weights: Sequence[float] | Tensor,
     *,
     recompute: bool = False,
 ) -> Tensor:
-    """Sum of ``weights[k] * intensity_of(places[k])``, with one intensity in memory at a time.
+    """Sum of ``weights[k] * intensity_of(arguments[k])``, with one intensity in memory at a time.
 
     Args:
-        intensity_of: Function that returns the intensity [...] for one item of ``places``, such as a wavelength in
+        intensity_of: Function that returns the intensity [...] for one of ``arguments``, such as a wavelength in
             metres or a direction of the illumination.
-        places: A tensor [K] of wavelengths, passed on as floats, or a sequence of K arguments for ``intensity_of``.
+        arguments: Of ``intensity_of``: a tensor [K] of wavelengths, passed on as floats, or a sequence of length K.
         weights: [K], such as those of ``Spectrum.samples``; a tensor may require gradients.
         recompute: If gradients are enabled, compute each intensity again in the backward pass instead of keeping its
             intermediate results. This takes a third more time, but only the memory of a single intensity.
 
     Raises:
         TypeError: ``intensity_of`` returns a complex tensor, a field instead of an intensity.
-        ValueError: ``places`` is empty, or the number of weights differs from that of places.
+        ValueError: ``arguments`` is empty, or the number of weights differs from that of arguments.
     """
-    items = places.tolist() if isinstance(places, Tensor) else list(places)
+    items = arguments.tolist() if isinstance(arguments, Tensor) else list(arguments)
     if not items or len(items) != len(weights):
-        raise ValueError(f"places and weights must be equally many and at least one, got {len(items)}, {len(weights)}")
+        counts = f"{len(items)}, {len(weights)}"
+        raise ValueError(f"arguments and weights must be equally many and at least one, got {counts}")
     again = recompute and torch.is_grad_enabled()
     total: Tensor | None = None
-    for place, weight in zip(items, weights, strict=True):
-        part = checkpoint(intensity_of, place, use_reentrant=False) if again else intensity_of(place)
+    for argument, weight in zip(items, weights, strict=True):
+        part = checkpoint(intensity_of, argument, use_reentrant=False) if again else intensity_of(argument)
         assert isinstance(part, Tensor)
         checks.real("intensity", part)
         # A float or a scalar float64 tensor does not change the dtype of the intensity.

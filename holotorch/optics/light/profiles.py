@@ -93,8 +93,8 @@ def bars(grid: Grid, pixels: tuple[int, ...] = (1, 2, 3, 4, 6, 8)) -> Tensor:
         if left + extent > width - 1 or extent > height // 2 - 2:
             break
         for k in (0, 2, 4):
-            begin = left + k * size
-            picture[1 : 1 + extent, begin : begin + size] = 1
+            start = left + k * size
+            picture[1 : 1 + extent, start : start + size] = 1
             top = height // 2 + 1 + k * size
             picture[top : top + size, left : left + extent] = 1
         left += extent + 2 * size

@@ -167,5 +167,5 @@ class SpeckleIntegral:
         identity, ones = torch.eye(count, dtype=positions.dtype), positions.new_ones(count, 1)
         top = torch.cat([self._second_moment(positions, positions) + _JITTER * identity, ones], 1)
         bottom = torch.cat([ones.T, positions.new_zeros(1, 1)], 1)
-        wanted = torch.cat([self._second_moment(positions, self.nodes) @ self.weights, positions.new_ones(1)])
-        return torch.linalg.solve(torch.cat([top, bottom]), wanted)[:count]
+        moments = torch.cat([self._second_moment(positions, self.nodes) @ self.weights, positions.new_ones(1)])
+        return torch.linalg.solve(torch.cat([top, bottom]), moments)[:count]

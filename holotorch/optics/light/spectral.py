@@ -25,9 +25,9 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity
 from holotorch.core.fourier import centred_fft2, centred_ifft2
 from holotorch.core.grid import Grid
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 from holotorch.optics.light.incoherent import incoherent_sum
-from holotorch.optics.light.wavelength_sampling import flawless, inseparable, least_followed, select_wavelengths
+from holotorch.optics.light.wavelength_sampling import error_free, least_count, pupil_exceeds_band, select_wavelengths
 from holotorch.optics.viewing.display import Display, number
 from holotorch.optics.viewing.elementwise import propagate_elements
 from holotorch.optics.viewing.eye import Eye
@@ -64,7 +64,7 @@ def neighbours(
     Raises ValueError for an eye with aberrations or colour error whose pupil transmits more than the band of ``grid``.
     """
     centre = checks.wavelengths(wavelength)[0]
-    if inseparable(grid, centre, display, eye):
+    if pupil_exceeds_band(grid, centre, display, eye):
         raise ValueError(
             "the aberrations of this eye cannot be replaced by those at another wavelength, since its pupil transmits "
             "more than the band of the grid; propagate every wavelength, or use a smaller pupil or a finer grid"
@@ -77,29 +77,29 @@ def neighbours(
 
     def parabola(values: Tensor, rate, rows: Tensor, columns: Tensor) -> Tensor:
         rate = torch.as_tensor(rate, dtype=torch.float64, device=values.device)
-        by_row, by_column = turns_phasor(rate * rows.square()), turns_phasor(rate * columns.square())
+        by_row, by_column = cycles_phasor(rate * rows.square()), cycles_phasor(rate * columns.square())
         return values * by_row.to(values.dtype) * by_column.to(values.dtype)
 
     def with_errors(values: Tensor, length: float, sign: int) -> Tensor:
         # Applies the errors of the eye in the plane of its pupil, or removes them with a sign of -1.
         path = eye.path(fy * (length * second), fx * (length * second), length)
-        return centred_ifft2(centred_fft2(values) * turns_phasor(path * (sign / length)).to(values.dtype))
+        return centred_ifft2(centred_fft2(values) * cycles_phasor(path * (sign / length)).to(values.dtype))
 
     rate = first / second / 2
-    if flawless(eye):
+    if error_free(eye):
         spectrum = centred_fft2(parabola(image, -curvature / (2 * centre), y, x))
     else:
         lit = parabola(image, (rate - curvature / 2) / centre, y, x)
         spectrum = centred_fft2(parabola(with_errors(lit, centre, -1), -rate / centre, y, x))
     for other in checks.wavelengths(list(others)):
         field = centred_ifft2(parabola(spectrum, -plane * (other - centre) / 2, fy, fx))
-        yield field if flawless(eye) else with_errors(parabola(field, rate / other, y, x), other, 1)
+        yield field if error_free(eye) else with_errors(parabola(field, rate / other, y, x), other, 1)
 
 
 def spectral_image(
     field: Tensor,
     grid: Grid,
-    places: Sequence[float] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
     weights: Sequence[float] | Tensor,
     display: Display,
     eye: Eye,
@@ -116,7 +116,7 @@ def spectral_image(
     Args:
         field: Field of the hologram, complex [..., H, W], the same for all wavelengths.
         grid: Sampling of the hologram.
-        places: Wavelengths [K] in metres, increasing, such as those of ``Spectrum.every`` or ``Spectrum.samples``.
+        wavelengths: [K] in metres, increasing, such as those of ``Spectrum.every`` or ``Spectrum.samples``.
         weights: Weights of the wavelengths, at least 0, [K] or [S, K] for S spectra; a tensor may require gradients.
         display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina and accommodation; the image is that of the plane in focus.
@@ -132,26 +132,25 @@ def spectral_image(
         Intensity [..., H, W] or [S, ..., H, W], real, on the coordinates of the plane in focus like ``retinal_image``.
 
     Raises:
-        ValueError: Neither or both of count and tolerance, places that do not increase, or invalid weights; the errors
-            of :func:`neighbours` and of the propagation to the retina.
+        ValueError: Neither or both of count and tolerance, wavelengths that do not increase, or invalid weights; the
+            errors of :func:`neighbours` and of the propagation to the retina.
 
     Warns SamplingWarning if the expected error of :func:`propagate_collapsed` exceeds 0.1, the default of ``Retina``.
     """
     checks.field("field", field, grid.shape)
     if (count is None) == (tolerance is None):
         raise ValueError(f"give either count or tolerance, got {count!r} and {tolerance!r}")
-    given = checks.wavelengths(torch.as_tensor(places, dtype=torch.float64).tolist())
+    given = checks.wavelengths(torch.as_tensor(wavelengths, dtype=torch.float64).tolist())
     lengths = torch.tensor(given, dtype=torch.float64)
     shares = torch.as_tensor(weights, dtype=torch.float64)
     if shares.ndim not in (1, 2) or len(lengths) != shares.shape[-1] or bool((lengths.diff() <= 0).any()):
-        raise ValueError(
-            f"places must increase, with one weight each, got {len(lengths)} places, weights {tuple(shares.shape)}"
-        )
+        got = f"{len(lengths)} wavelengths, weights {tuple(shares.shape)}"
+        raise ValueError(f"wavelengths must increase, with one weight each, got {got}")
     if not bool((shares >= 0).all()) or not 0 < shares.sum() < math.inf:
         raise ValueError(f"weights must be at least 0, finite and not all 0, got {shares.tolist()}")
     power = shares.detach().reshape(-1, len(lengths)).sum(0)
     if tolerance is not None:
-        count = least_followed(lengths, power, tolerance, grid, display, eye, reach=reach)
+        count = least_count(lengths, power, tolerance, grid, display, eye, reach=reach)
     nodes, nearest = select_wavelengths(lengths, power, count or 0)
     propagate = propagate_elements if elements else propagate_collapsed
     if not elements:

@@ -31,7 +31,7 @@ class SpectralRetina(nn.Module):
             K may differ between channels.
         display: Positions of the hologram, the eyepiece and the eye.
         eye: Pupil, retina and accommodation; the image is that of the plane in focus.
-        count: Number of wavelengths to propagate in each channel; ``wavelength_sampling.least_followed`` finds it.
+        count: Number of wavelengths to propagate in each channel; ``wavelength_sampling.least_count`` finds it.
         recompute: In training, take a third more time and only the memory of one propagated wavelength of one channel
             of one field, as in :func:`incoherent_sum`.
         options: ``tolerance``, ``paraxial``, ``reach``, ``registered`` and ``memory_limit`` of ``Retina``, for the
@@ -60,7 +60,7 @@ class SpectralRetina(nn.Module):
         if not spectra:
             raise ValueError("SpectralRetina needs wavelengths and weights for at least one channel, got none")
         self.grid, self.recompute = grid, recompute
-        self.spectra = tuple(_checked(*each) for each in spectra)
+        self.spectra = tuple(_checked(*spectrum) for spectrum in spectra)
         # The brightest wavelength of each channel, for tables and comparisons.
         self.wavelengths = tuple(max(zip(weights, lengths, strict=True))[1] for lengths, weights in self.spectra)
         self.chosen = [
@@ -86,7 +86,7 @@ class SpectralRetina(nn.Module):
             y, x = ((wide - n) // 2 for wide, n in zip(self.wide[c].shape, self.grid.shape, strict=True))
             padded = functional.pad(light, (x, x, y, y))[..., None, :, :]
             if self.recompute and padded.ndim > 3:  # one by one, since each is computed again on its own
-                parts = [self._channel(each, c) for each in padded.flatten(0, -4)]
+                parts = [self._channel(field, c) for field in padded.flatten(0, -4)]
                 total = torch.stack(parts).unflatten(0, padded.shape[:-3])
             else:
                 total = self._channel(padded, c)

@@ -15,25 +15,27 @@ _POINTS, _RINGS, _RAYS = 9, 16, 64  # points per axis of the scene; rings of the
 
 
 @dataclass(frozen=True)
-class SeenLight:
+class PupilIllumination:
     """Light of a hologram that enters an eye, from geometrical optics and the diffraction at the edge of the window.
 
     Attributes:
-        rim: Fraction of the edge of the pupil that is illuminated, 0 to 1; 0 if only the window or the highest
+        edge: Fraction of the edge of the pupil that is illuminated, 0 to 1; 0 if only the window or the highest
             frequency of the hologram limits the light.
         path_difference: As in ``coherence.path_difference``, in metres; the maximum over points on and off the axis.
-        bend: Standard deviation in metres, over the rays of a point, of the part z slope^4 / 8 of their paths that the
-            Fresnel model neglects.
-        diffracted: Share of the light that the edges of the window diffract to the edge of a pupil whose ``rim`` is 0.
+        fourth_order: Standard deviation in metres, over the rays of a point, of the part z slope^4 / 8 of their paths,
+            which the Fresnel model neglects.
+        diffracted: Share of the light that the edges of the window diffract to the edge of the pupil if ``edge`` is 0.
     """
 
-    rim: float
+    edge: float
     path_difference: float
-    bend: float
+    fourth_order: float
     diffracted: float = 0.0
 
 
-def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None) -> SeenLight:
+def pupil_illumination(
+    grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None
+) -> PupilIllumination:
     """The light that enters an eye, from rays traced from the plane in focus to the pupil and to the hologram.
 
     Args:
@@ -73,63 +75,67 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     shares = inside * radii[:, None]  # weight of each ring: its area
     neglected = path.square() / max(2 * abs(plane), 1e-30)  # z s^4 / 8 = (z s^2 / 2)^2 / (2 z)
     mean = (shares * neglected).sum((-2, -1), keepdim=True) / shares.sum((-2, -1), keepdim=True).clamp_min(1e-30)
-    bend = ((shares * (neglected - mean).square()).sum() / shares.sum().clamp_min(1e-30)).sqrt().item()
-    rim = inside[..., -1, :].double().mean().item() if radius <= illuminated else 0.0
+    fourth_order = ((shares * (neglected - mean).square()).sum() / shares.sum().clamp_min(1e-30)).sqrt().item()
+    edge = inside[..., -1, :].double().mean().item() if radius <= illuminated else 0.0
     diffracted = 0.0
-    if rim == 0:  # beyond the lit part the power falls as width / (pi^2 distance), from the edges of a window
+    if edge == 0:  # beyond the lit part the power falls as width / (pi^2 distance), from the edges of a window
         width = max(centre * abs(second) / (2 * side) for side in sides if side > 0)
         diffracted = width / (math.pi**2 * max(radius - illuminated, width))
-    return SeenLight(rim, spread.max().item(), bend, diffracted)
+    return PupilIllumination(edge, spread.max().item(), fourth_order, diffracted)
 
 
-def select_wavelengths(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
+def select_wavelengths(wavelengths: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
     """Select ``count`` wavelengths with equal shares of the power, and assign every wavelength to the nearest of them.
 
     Args:
-        places: Wavelengths [K] in metres, increasing.
+        wavelengths: Wavelengths [K] in metres, increasing.
         weights: Power at these wavelengths, positive, [K].
         count: Between 1 and K.
 
     Returns:
-        Indices into ``places`` of the selected wavelengths, and for each of ``places`` the index into that list of the
-        nearest selected wavelength. If few wavelengths contain most of the power, fewer than ``count`` are selected.
+        Indices of the selected wavelengths, and for each of ``wavelengths`` the index into that list of the nearest
+        selected one. If few wavelengths contain most of the power, fewer than ``count`` are selected.
     """
-    if not 1 <= checks.whole("count", count, 1) <= len(places):
-        raise ValueError(f"count must be at most {len(places)}, the number of wavelengths given, got {count}")
+    if not 1 <= checks.whole("count", count, 1) <= len(wavelengths):
+        raise ValueError(f"count must be at most {len(wavelengths)}, the number of wavelengths given, got {count}")
     cumulative = weights.cumsum(0) / weights.sum()
     targets = (torch.arange(count, dtype=cumulative.dtype) + 0.5) / count
-    nodes = list(range(count)) if count == len(places) else torch.searchsorted(cumulative, targets).unique().tolist()
-    return nodes, (places - places[nodes][:, None]).abs().argmin(0).tolist()
+    nodes = (
+        list(range(count)) if count == len(wavelengths) else torch.searchsorted(cumulative, targets).unique().tolist()
+    )
+    return nodes, (wavelengths - wavelengths[nodes][:, None]).abs().argmin(0).tolist()
 
 
-def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLight) -> float:
-    """Expected error of ``spectral_image`` that propagates ``count`` of ``places``, relative to the mean image.
+def neighbour_error(wavelengths: Tensor, weights: Tensor, count: int, light: PupilIllumination) -> float:
+    """Expected error of ``spectral_image`` that propagates ``count`` of ``wavelengths``, relative to the mean image.
 
     The error has two parts. First, the light at the edge of the pupil changes with wavelength like a random walk, by a
-    fraction 2 rim / wavelength of the power per metre of wavelength (``rim`` or ``diffracted`` of ``light``). Every
+    fraction 2 edge / wavelength of the power per metre of wavelength (``edge`` or ``diffracted`` of ``light``). Every
     step of the walk is weighted with the power of the wavelengths beyond it that are derived from the same propagated
-    wavelength. Second, the Fresnel model between neighbours neglects the fourth order of the slopes (``bend`` of
-    ``light``). If the light illuminates only small parts of the edge, the true error is only 0.1 to 0.5 times the
+    wavelength. Second, the Fresnel model between neighbours neglects the fourth order of the slopes (``fourth_order``
+    of ``light``). If the light illuminates only small parts of the edge, the true error is only 0.1 to 0.5 times the
     result.
     """
-    nodes, nearest = select_wavelengths(places, weights, count)
+    nodes, nearest = select_wavelengths(wavelengths, weights, count)
     share = weights / weights.sum()
-    offsets = places - places[nodes][nearest]
+    offsets = wavelengths - wavelengths[nodes][nearest]
     walk = 0.0
     for node in range(len(nodes)):
-        own = torch.tensor(nearest) == node
-        for side in (own & (offsets >= 0), own & (offsets <= 0)):
+        derived = torch.tensor(nearest) == node
+        for side in (derived & (offsets >= 0), derived & (offsets <= 0)):
             distances, order = offsets[side].abs().sort()
             beyond = share[side][order].flip(0).cumsum(0).flip(0)
             walk += (beyond[1:].square() * distances.diff()).sum().item()
-    middle = places.mean().item()
+    middle = wavelengths.mean().item()
     # The fourth-order phase is proportional to wavelength^3, so its relative change is 3 times that of the wavelength.
-    bent = math.sqrt(2) * 2 * math.pi * 3 * light.bend / middle * (share * offsets.abs()).sum().item() / middle
-    return math.hypot(math.sqrt(4 * max(light.rim, light.diffracted) * walk / middle), bent)
+    neglected = (
+        math.sqrt(2) * 2 * math.pi * 3 * light.fourth_order / middle * (share * offsets.abs()).sum().item() / middle
+    )
+    return math.hypot(math.sqrt(4 * max(light.edge, light.diffracted) * walk / middle), neglected)
 
 
-def least_followed(
-    places: Tensor,
+def least_count(
+    wavelengths: Tensor,
     weights: Tensor,
     tolerance: float,
     grid: Grid,
@@ -143,21 +149,21 @@ def least_followed(
     The result is the number of all wavelengths if the eye is one for which ``neighbours`` raises ValueError.
     """
     tolerance = checks.positive("tolerance", tolerance)
-    light = seen_light(grid, places.mean().item(), display, eye, reach=reach)
-    if inseparable(grid, places.min().item(), display, eye):
-        return len(places)
-    counts = range(1, len(places))
-    return next((n for n in counts if neighbour_error(places, weights, n, light) <= tolerance), len(places))
+    light = pupil_illumination(grid, wavelengths.mean().item(), display, eye, reach=reach)
+    if pupil_exceeds_band(grid, wavelengths.min().item(), display, eye):
+        return len(wavelengths)
+    counts = range(1, len(wavelengths))
+    return next((n for n in counts if neighbour_error(wavelengths, weights, n, light) <= tolerance), len(wavelengths))
 
 
-def flawless(eye: Eye) -> bool:
+def error_free(eye: Eye) -> bool:
     """Whether an eye has neither aberrations nor colour error."""
     return not eye.aberrations and eye.chromatic_reference is None
 
 
-def inseparable(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
+def pupil_exceeds_band(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
     """Whether the pupil of an eye with errors exceeds the band of ``grid``, so that they cannot be removed."""
-    if flawless(eye):
+    if error_free(eye):
         return False
     second = number(display.matrix(number(display.focus_plane(eye.accommodation)))[1])
     highest = (number(eye.pupil_radius) + 8 * eye.softness) / (centre * abs(second))

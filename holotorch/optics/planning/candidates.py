@@ -141,7 +141,7 @@ def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldC
     positions = [position.item() for position in shifts(planes, *geometry)]
     # Light that travels backward is the conjugate of light that travels forward with the opposite tilt.
     backward = distance < 0
-    signals = [each.conj() if backward else each for each in content.signals or ()]
+    signals = [signal.conj() if backward else signal for signal in content.signals or ()]
     sines = [-sine if backward else sine for sine in planes.tilt]
     y, x = (
         AxisContent(

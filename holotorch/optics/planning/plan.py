@@ -44,7 +44,7 @@ def plan_propagation(
     wavelengths = checks.wavelengths(wavelength)
     planes = plane_pair(grid, out_grid, offset, tilt, wavelengths)
     distances = list(distance) if isinstance(distance, Sequence) else [distance]
-    distances = [checks.quantity(DISTANCE, each) for each in distances]
+    distances = [checks.quantity(DISTANCE, distance) for distance in distances]
     content = field_content(grid, wavelengths, distances, band=band, spread=spread, margin=margin, field=field)
     return plan_from(candidates(planes, wavelengths, distances, content, dtype), planes, tolerance, memory_limit, dtype)
 

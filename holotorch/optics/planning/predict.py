@@ -20,9 +20,9 @@ from holotorch.optics.free_space.impulse_response import (
     levelling_shift,
     remainder_kernel,
     tap_indices,
-    tilted_turns,
+    tilted_cycles,
 )
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 
 _TONES = 17  # tones that represent the band of one axis
 _SLICES = 9  # evenly spaced slices
@@ -111,7 +111,7 @@ class AxisContent:
                 return fraction
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
         cycles = -self.wavelength * self.curving_distance / 2 * frequency.square() + frequency * self.shift * self.pitch
-        repeated = torch.fft.ifft(turns_phasor(cycles))
+        repeated = torch.fft.ifft(cycles_phasor(cycles))
         return self._energy(repeated[self._shifts % padded] - self._taps) / self.captured
 
     def wrapped_slices(self, padded: int, other: "AxisContent", *, limited: bool) -> float:
@@ -154,7 +154,7 @@ class AxisContent:
             # Each slice is shifted so that its phase is equal at both ends of the band, which adjoin in the DFT.
             wavelength, distance, tilt = self._scene
             ends = torch.tensor((self.nyquist, -self.nyquist), dtype=torch.float64)
-            cycles = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
+            cycles = tilted_cycles(ends, other.slices, wavelength, distance, tilt, squares=False)
             exact = self._levelled(padded, other, (cycles[:, :1] - cycles[:, 1:]) / (2 * self.nyquist))
         self._exact.append(exact)
         return exact
@@ -162,7 +162,7 @@ class AxisContent:
     def _levelled(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
         """Taps [K, n + m - 1]: Fresnel taps moved by ``shift`` [K, 1] metres, times the factor beyond Fresnel."""
         index = tap_indices(padded, self.size, self.window)
-        taps = torch.stack([self._fresnel(index + each / self.pitch) for each in shift[:, 0]])
+        taps = torch.stack([self._fresnel(index + offset / self.pitch) for offset in shift[:, 0]])
         factor = self._levelled_factor(padded, other, shift)
         return torch.fft.ifft(torch.fft.fft(taps) * factor)[:, self._shifts % padded]
 
@@ -170,12 +170,12 @@ class AxisContent:
         """Factor beyond Fresnel [K, padded] of the slices, without the phase of a displacement by ``shift`` [K, 1]."""
         wavelength, distance, tilt = self._scene
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
-        cycles = tilted_turns(frequency, other.slices, wavelength, distance, tilt, squares=False)
-        return turns_phasor(cycles - frequency * shift) * self._across(other)
+        cycles = tilted_cycles(frequency, other.slices, wavelength, distance, tilt, squares=False)
+        return cycles_phasor(cycles - frequency * shift) * self._across(other)
 
     def _across(self, other: "AxisContent") -> Tensor:
         """Paraxial phase factor [K, 1] of the slices, which depends on the frequency of the other axis only."""
-        return turns_phasor(-self.wavelength * other.curving_distance / 2 * other.slices.square())
+        return cycles_phasor(-self.wavelength * other.curving_distance / 2 * other.slices.square())
 
     @property
     def _scene(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -239,10 +239,10 @@ class AxisContent:
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
         cycles = frequency * self.shift * self.pitch
         if any(self.tilt):
-            kernel = turns_phasor(tilted_turns(frequency, other.slices, wavelength, distance, tilt) + cycles)
+            kernel = cycles_phasor(tilted_cycles(frequency, other.slices, wavelength, distance, tilt) + cycles)
         else:
             root = torch.sqrt(1 - (wavelength * frequency).square() - (wavelength * other.slices).square() + 0j)
-            kernel = turns_phasor(distance / wavelength * (root.real - 1) + cycles)
+            kernel = cycles_phasor(distance / wavelength * (root.real - 1) + cycles)
             kernel = kernel * torch.exp(-2 * math.pi * distance / wavelength * root.imag)
             steep = 2 * distance * wavelength * frequency.abs() > extent * root.abs()
             kernel = torch.where(steep, 0.0, kernel)
@@ -361,7 +361,7 @@ class AxisContent:
             return self.measured
         n = torch.arange(self.size, dtype=torch.float64)
         frequencies = torch.linspace(-1, 1, _TONES, dtype=torch.float64) * self.band * self.pitch
-        tones = self._fade(n) * turns_phasor(frequencies[:, None] * n)
+        tones = self._fade(n) * cycles_phasor(frequencies[:, None] * n)
         tones[[0, -1]] *= math.sqrt(0.5)  # trapezoidal rule over the band
         return tones / math.sqrt(_TONES - 1)
 

@@ -17,16 +17,12 @@ from holotorch.core.operator import Wavelengths
 from holotorch.core.plan import Plan
 from holotorch.core.quantities import DISTANCE, WAVELENGTH, Quantity
 from holotorch.optics.free_space.kernels import carrier
-from holotorch.optics.free_space.learned_distance import has_closed_form
+from holotorch.optics.free_space.learned_distance import has_closed_form, times_learned
 from holotorch.optics.free_space.padding import FINEST
 from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 from holotorch.optics.free_space.propagators import DistanceFilter, checked_distance, checked_wavelengths
 from holotorch.optics.free_space.resampled import ResampledKernel, resample, resampling_factors
-from holotorch.optics.free_space.transfer import (
-    times_transfer_function,
-    transfer_function,
-    wide_transfer_function,
-)
+from holotorch.optics.free_space.transfer import transfer_function, wide_transfer_function
 from holotorch.optics.free_space.zoomed import ZoomedFilter, chirps, zoomed
 from holotorch.optics.planning.candidates import ZOOMED, Candidate, Method, candidates
 from holotorch.optics.planning.content import FieldContent, field_content
@@ -101,7 +97,7 @@ def propagate(
     """
     norms = _checked_norms(field, grid)
     call = grid, wavelength, distance, plan, tolerance, out_grid, offset, tilt, band, spread, margin
-    tensors = any(isinstance(each, Tensor) for each in (wavelength, distance, tilt))
+    tensors = any(isinstance(value, Tensor) for value in (wavelength, distance, tilt))
     if measure or tensors or torch.compiler.is_compiling():
         job = _prepared(*call, field.dtype, field.device, example=field if measure else None)
     else:
@@ -192,14 +188,10 @@ def _propagate_anew(
     """Propagate ``field`` by one method, with a new kernel for each wavelength and distance in turn."""
 
     def filtered(spectrum: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
-        if tilt is None and candidate.method != "identity" and has_closed_form(planes, wavelength, distance):
-            product = _times_kernel(spectrum, wavelength, distance, planes=planes, method=candidate)
-        else:
-            kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
-            # Several distances share the spectrum; for a single one its memory is reused.
-            single = wavelengths.numel() * distances.numel() == 1
-            product = multiplied(spectrum, kernel) if single else spectrum * kernel
-        return ifft2(product, planes.out.shape)
+        # Several distances share the spectrum; for a single one its memory is reused.
+        single = wavelengths.numel() * distances.numel() == 1
+        times = partial(_times_kernel, planes=planes, method=candidate, tilt=tilt, overwrite=single)
+        return ifft2(times(spectrum, wavelength, distance), planes.out.shape)
 
     def zoomed_in(field: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
         kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
@@ -287,7 +279,7 @@ class Propagator(nn.Module):
         _accept(best, tolerance)
         if planes.same_pitch:
             self.operator = DistanceFilter(
-                grid, wavelengths, distance, best.padded, partial(_transfer_function, planes, best.plain),
+                grid, wavelengths, distance, best.padded, partial(kernel_of, planes, best.plain),
                 times=partial(_times_kernel, planes=planes, method=best.plain),
                 out_grid=planes.out, learnable=learnable,
             )  # fmt: skip
@@ -452,22 +444,26 @@ def _warn_if_dim(
         )
 
 
-def _transfer_function(
-    planes: PlanePair, candidate: Method, wavelength: Tensor, distance: Tensor, dtype: torch.dtype
-) -> Tensor:
-    return kernel_of(planes, candidate, wavelength, distance, dtype)
-
-
 def _times_kernel(
-    spectrum: Tensor, wavelength: Tensor, distance: Tensor, *, planes: PlanePair, method: Method
+    spectrum: Tensor,
+    wavelength: Tensor,
+    distance: Tensor,
+    *,
+    planes: PlanePair,
+    method: Method,
+    tilt: Tensor | None = None,
+    overwrite: bool = True,
 ) -> Tensor:
-    """``spectrum`` [..., H, W], which may be overwritten, times :func:`kernel_of`."""
-    if method.method == "identity" or not has_closed_form(planes, wavelength, distance):
-        return multiplied(spectrum, kernel_of(planes, method, wavelength, distance, spectrum.dtype))
-    padded, sampled, paraxial = Grid(method.padded, planes.grid.pitch), method.sampled, method.paraxial
-    return times_transfer_function(
-        spectrum, wavelength, distance, planes=planes, padded=padded, sampled=sampled, paraxial=paraxial
-    )
+    """``spectrum`` [..., H, W] times :func:`kernel_of`, by its closed form if only one distance is learned."""
+    if tilt is None and method.method != "identity" and has_closed_form(planes, wavelength, distance):
+        padded = Grid(method.padded, planes.grid.pitch)
+        by_autograd = partial(kernel_of, planes, method, dtype=spectrum.dtype)
+        return times_learned(
+            spectrum, padded, wavelength, distance,
+            sampled=method.sampled, paraxial=method.paraxial, differentiable=by_autograd,
+        )  # fmt: skip
+    kernel = kernel_of(planes, method, wavelength, distance, spectrum.dtype, tilt)
+    return multiplied(spectrum, kernel) if overwrite else spectrum * kernel
 
 
 def kernel_of(

@@ -12,7 +12,7 @@ from holotorch.core.deprecation import renamed
 from holotorch.core.fourier import fft2, filter_spectrum, good_length
 from holotorch.core.grid import Grid
 from holotorch.optics.elements.lens import pupil
-from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel, turns_phasor
+from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, cycles_phasor, fresnel_kernel
 from holotorch.optics.free_space.zoomed import chirp, chirps, zoom, zoomed
 from holotorch.optics.viewing import rays
 from holotorch.optics.viewing.display import Display, Length, inverse, number
@@ -182,7 +182,7 @@ def _image(
 
     def lens(focal_length: Length) -> Tensor:
         power = torch.as_tensor(inverse(focal_length), dtype=torch.float64)
-        return turns_phasor(-power / (2 * wavelength) * (y.square() + x.square()))
+        return cycles_phasor(-power / (2 * wavelength) * (y.square() + x.square()))
 
     y, x = fine.coordinates(field.device)
     kernel = free_space(padded, display.lens_distance)

@@ -12,7 +12,7 @@ from holotorch.core.grid import Grid
 from holotorch.core.learning import without_graph
 from holotorch.core.quantities import ACCOMMODATION, EYE_LENGTH, PUPIL_RADIUS, SOFTNESS, WAVEFRONT_ERROR
 from holotorch.optics.elements.lens import Transmission, affordable, lens_phase, opening, warn_if_coarse
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor
 from holotorch.optics.viewing.display import Length, inverse, number
 
 _HIGHEST = 27  # largest OSA index of a Zernike polynomial: sixth radial order
@@ -72,7 +72,7 @@ class Eye:
         """
         square = y.square() + x.square()
         radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
-        return opening(square, radius, self.softness) * turns_phasor(self.path(y, x, wavelength) / wavelength)
+        return opening(square, radius, self.softness) * cycles_phasor(self.path(y, x, wavelength) / wavelength)
 
     def path(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
         """Path in metres, float64, that all aberrations add; arguments as in :meth:`pupil_function`."""
@@ -121,7 +121,7 @@ class EyeLens(Transmission):
         length = torch.as_tensor(eye.focal_length, dtype=torch.float64)
         y, x = self.grid.coordinates(length.device)
         values = [
-            turns_phasor(lens_phase(self.grid, each, length) / (2 * math.pi)) * eye.pupil_function(y, x, each)
+            cycles_phasor(lens_phase(self.grid, each, length) / (2 * math.pi)) * eye.pupil_function(y, x, each)
             for each in self.wavelengths
         ]
         return torch.stack(values)

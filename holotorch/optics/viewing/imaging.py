@@ -40,8 +40,8 @@ from holotorch.core.grid import Grid
 from holotorch.optics.free_space.kernels import (
     angular_spectrum_kernel,
     carrier,
+    cycles_phasor,
     fresnel_kernel,
-    turns_phasor,
     window_taper,
 )
 from holotorch.optics.free_space.zoomed import Chirp, chirps, zoomed
@@ -262,7 +262,7 @@ def collapse_factors(
     paraxial: bool,
 ) -> list[CollapseFactors]:
     """Factors of :func:`propagate_collapsed` for each wavelength, on the device and in the dtype of ``like``."""
-    return [_factors(like, grid, each, display, eye, plane, sizes, paraxial) for each in wavelengths]
+    return [_factors(like, grid, wavelength, display, eye, plane, sizes, paraxial) for wavelength in wavelengths]
 
 
 def _factors(
@@ -292,7 +292,7 @@ def _factors(
     chirp_factors = [] if sizes.plain else chirps(grid, padded, fine, (0.0, 0.0), device)
     zoom = [(a.to(dtype), b.to(dtype), c.to(dtype)) for a, b, c in chirp_factors]
     rate = torch.as_tensor(first / second, dtype=torch.float64, device=device) / (2 * wavelength)
-    curvature = [turns_phasor(rate * each.square()).to(dtype) for each in fine.coordinates(device)]
+    curvature = [cycles_phasor(rate * coordinate.square()).to(dtype) for coordinate in fine.coordinates(device)]
     bands = pupil_bands(grid, wavelength, display, eye, plane)
     # The positions (eta, xi) on the pupil of the frequencies of the spectrum. The window has the same width at both
     # pitches and therefore the same frequency step.
@@ -307,7 +307,7 @@ def _factors(
         aberration = display.eye_distance * (back / second) ** 4 + 1 / eye.axial_length**3
         cycles = cycles - aberration / (8 * wavelength) * square.square()
     norm = math.sqrt(math.prod(window.shape) / math.prod(fine.shape))
-    pupil = (eye.pupil_function(eta, xi, wavelength) * turns_phasor(cycles) * norm).to(dtype)
+    pupil = (eye.pupil_function(eta, xi, wavelength) * cycles_phasor(cycles) * norm).to(dtype)
     return CollapseFactors(kernel, zoom, (curvature[0], curvature[1]), pupil, bands)
 
 
@@ -352,12 +352,12 @@ def zoom_flops(padded: tuple[int, int], fine: tuple[int, int]) -> float:
     return sum(10 * lines * n * math.log2(n) for lines, n in ((py, px + fx), (fx, py + fy)))
 
 
-def warn_if_coarse(sampling: Sequence[float], least: Sequence[float], sampled: str, aliases: str) -> None:
-    """SamplingWarning in the name of the caller's caller if an oversampling (y, x) is below ``least``."""
-    if any(given < needed * (1 - 1e-9) for given, needed in zip(sampling, least, strict=True)):
+def warn_if_coarse(sampling: Sequence[float], required: Sequence[float], sampled: str, aliases: str) -> None:
+    """SamplingWarning in the name of the caller's caller if an oversampling (y, x) is below ``required``."""
+    if any(given < needed * (1 - 1e-9) for given, needed in zip(sampling, required, strict=True)):
         warnings.warn(
             f"{sampled} sampled {max(sampling):.3g} times as fine as the hologram {aliases}; "
-            f"{max(least):.3g} times would do",
+            f"{max(required):.3g} times would do",
             SamplingWarning,
             stacklevel=3,
         )

@@ -47,11 +47,11 @@ def noise_lines(grid: Grid) -> Lines:
     return _both_axes(grid, lambda size, pitch: _noise(size))
 
 
-def scene_lines(grid: Grid, wavelength: float, plane: float, reach: float) -> Lines:
-    """Lines of a hologram of white noise that lies in the plane ``plane`` within ``reach`` of the axis, in metres."""
+def scene_lines(grid: Grid, wavelength: float, plane: float, half_width: float) -> Lines:
+    """Lines of a hologram of white noise in the plane ``plane`` within ``half_width`` of the axis, in metres."""
 
     def light(size: int, pitch: float) -> Tensor:
-        points = 2 * math.floor(reach / pitch) + 1
+        points = 2 * math.floor(half_width / pitch) + 1
         enough = samples_for_all_light(points, size, pitch, wavelength, plane)
         padded = Grid((1, good_length(math.ceil(max(enough, points, size)))), pitch)
         kernel = angular_spectrum_kernel(padded, wavelength, -plane, band_limit=False)
@@ -65,12 +65,12 @@ def field_lines(field: Tensor) -> Lines:
     """Columns and rows of ``field`` [..., H, W], those at equal steps of the energy that they hold together."""
     stack = field.detach().to("cpu", torch.complex128).reshape(-1, *field.shape[-2:])
     lines = []
-    for each in (stack.transpose(-1, -2), stack):
-        each = each.reshape(-1, each.shape[-1])
-        energy = intensity(each).sum(-1).cumsum(0)
+    for fields in (stack.transpose(-1, -2), stack):
+        candidates = fields.reshape(-1, fields.shape[-1])
+        energy = intensity(candidates).sum(-1).cumsum(0)
         steps = (torch.arange(_LINES, dtype=torch.float64) + 0.5) / _LINES * energy[-1]
-        chosen = torch.searchsorted(energy, steps).clamp(max=len(each) - 1)
-        lines.append(each[chosen] if each.shape[-1] > 1 else None)
+        chosen = torch.searchsorted(energy, steps).clamp(max=len(candidates) - 1)
+        lines.append(candidates[chosen] if candidates.shape[-1] > 1 else None)
     return lines[0], lines[1]
 
 
@@ -99,15 +99,15 @@ def line_errors(
         for axis, light in enumerate(channel):
             if light is None:
                 continue
-            sizes = tuple(_of_axis(each, axis) for each in samplings)
+            sizes = tuple(_of_axis(sampling, axis) for sampling in samplings)
             key = id(light), grid.pitch[axis], sizes  # equal axes have equal errors
             if key not in known:
                 line = Grid((1, light.shape[1]), grid.pitch[axis])
-                steps = [_pupil_step(each, line, wavelength, display, plane) for each in sizes]
+                steps = [_pupil_step(sampling, line, wavelength, display, plane) for sampling in sizes]
                 setup = line, wavelength, display, _between_samples(eye, max(steps)), plane, paraxial
                 exact = _image(light, _finer(least, axis), *setup)
-                images = [_image(light.to(dtype), each, *setup) for each in sizes]
-                known[key] = exact.square().sum(), torch.stack([(each - exact).square().sum() for each in images])
+                images = [_image(light.to(dtype), sampling, *setup) for sampling in sizes]
+                known[key] = exact.square().sum(), torch.stack([(image - exact).square().sum() for image in images])
             parts.append(known[key])
         energy = sum(exact for exact, _ in parts) / len(parts)
         squares += energy * sum(error / exact.clamp_min(1e-300) for exact, error in parts)
@@ -157,11 +157,13 @@ def _of_axis(sampling: Sampling, axis: int) -> Sampling:
     return replace(sampling, **sizes)
 
 
-def _finer(least: ElementSampling, axis: int) -> ElementSampling:
+def _finer(sampling: ElementSampling, axis: int) -> ElementSampling:
     """The sampling of the reference for a line along ``axis``."""
-    padded, fine = _WIDER * least.padded[axis], _FINER * _WIDER * least.fine[axis]
+    padded, fine = _WIDER * sampling.padded[axis], _FINER * _WIDER * sampling.fine[axis]
     return ElementSampling(
-        (1.0, _FINER * least.oversampling[axis]), (1, good_length(math.ceil(padded))), (1, good_length(math.ceil(fine)))
+        (1.0, _FINER * sampling.oversampling[axis]),
+        (1, good_length(math.ceil(padded))),
+        (1, good_length(math.ceil(fine))),
     )
 
 

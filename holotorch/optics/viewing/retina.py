@@ -121,7 +121,7 @@ def plan_retina(
         f"{best.predicted_error:.2g} {'within' if best.adequate else 'beyond'} {limit_of_error:g}, "
         f"{best.flops:.2g} operations, {best.memory_bytes:.2g} bytes"
     )
-    runner_up = next((each.reason for each in options if each is not best), impossible)
+    runner_up = next((option.reason for option in options if option is not best), impossible)
     ratio, error = best.flops / cheapest.flops, cheapest.predicted_error
     return replace(best, reason=reason, runner_up=runner_up, cost_ratio=ratio, cheapest_error=error)
 
@@ -174,31 +174,31 @@ def _lines(
     if reach is None:
         return [noise_lines(grid)] * len(wavelengths)
     half_width = checks.quantity(WIDTH, reach, "reach")
-    return [scene_lines(grid, each, plane, half_width) for each in wavelengths]
+    return [scene_lines(grid, wavelength, plane, half_width) for wavelength in wavelengths]
 
 
 def _choice(options: list[RetinaPlan], tolerance: float | None, limit: float) -> tuple[RetinaPlan, RetinaPlan]:
     """The plan within ``limit`` bytes that :func:`plan_retina` returns, and the cheapest one."""
-    fitting = [each for each in options if each.memory_bytes <= limit]
+    fitting = [option for option in options if option.memory_bytes <= limit]
     if not fitting:
         raise ValueError(
             f"no method fits into {limit:.3g} bytes, the smallest takes "
-            f"{min(each.memory_bytes for each in options):.3g}; crop the hologram or raise memory_limit"
+            f"{min(option.memory_bytes for option in options):.3g}; crop the hologram or raise memory_limit"
         )
-    usable = [each for each in fitting if each.predicted_error <= _UNUSABLE]
+    usable = [option for option in fitting if option.predicted_error <= _UNUSABLE]
     if not usable:
-        best = min(fitting, key=lambda each: each.predicted_error)
+        best = min(fitting, key=lambda option: option.predicted_error)
         raise ValueError(
             f"the only method that fits, {best.method}, has an expected error of {best.predicted_error:.2g}; raise "
             "memory_limit, or make the scene smaller (reach)"
         )
-    cheapest = min(usable, key=lambda each: each.flops)
+    cheapest = min(usable, key=lambda option: option.flops)
     if tolerance is None:
         return cheapest, cheapest
-    adequate = [each for each in usable if each.adequate]
+    adequate = [option for option in usable if option.adequate]
     if adequate:
-        return min(adequate, key=lambda each: each.flops), cheapest
-    return min(usable, key=lambda each: each.predicted_error), cheapest
+        return min(adequate, key=lambda option: option.flops), cheapest
+    return min(usable, key=lambda option: option.predicted_error), cheapest
 
 
 def _option(

@@ -23,7 +23,7 @@ class RetinaViews(nn.Module):
 
     def __init__(self, retinas: Sequence[nn.Module]):
         super().__init__()
-        if len({(each.grid, each.wavelengths) for each in retinas}) != 1:
+        if len({(retina.grid, retina.wavelengths) for retina in retinas}) != 1:
             raise ValueError("RetinaViews needs at least one retina, and all with the same grid and wavelengths")
         self.retinas = nn.ModuleList(retinas)
 

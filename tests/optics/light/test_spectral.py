@@ -9,7 +9,12 @@ from holotorch import Grid
 from holotorch.optics import Display, Eye, Spectrum, propagate_collapsed, propagate_elements, spectral_image
 from holotorch.optics.light.quadrature import gauss_rule
 from holotorch.optics.light.spectral import neighbours
-from holotorch.optics.light.wavelength_sampling import least_followed, neighbour_error, seen_light, select_wavelengths
+from holotorch.optics.light.wavelength_sampling import (
+    least_count,
+    neighbour_error,
+    pupil_illumination,
+    select_wavelengths,
+)
 
 PITCH, GREEN, FAR = 3.74e-6, 520e-9, 30e-3
 GRID = Grid((128, 120), PITCH)
@@ -48,8 +53,8 @@ def test_the_error_is_foreseen(preset):
     """From above: light is taken to be at a hard rim evenly, and all errors to be seen in a picture without speckle."""
     grid, eye = Grid(256, PITCH), Eye(0.5e-3, 24e-3, 120e-3, softness=20e-6)
     places, weights = preset(GREEN).every(1e-9)
-    light, field = seen_light(grid, GREEN, DISPLAY, eye), random_phase(grid, torch.complex64)
-    assert 0.3 < light.rim < 0.5
+    light, field = pupil_illumination(grid, GREEN, DISPLAY, eye), random_phase(grid, torch.complex64)
+    assert 0.3 < light.edge < 0.5
     wanted = spectral_image(field, grid, places, weights, DISPLAY, eye, count=len(places))
     expected = [neighbour_error(places, weights, count, light) for count in (1, 3, len(places))]
     for count, limit in zip((1, 3), expected, strict=False):
@@ -60,9 +65,9 @@ def test_the_error_is_foreseen(preset):
 def test_the_tolerance_decides_how_many_are_followed():
     grid, eye = Grid(256, PITCH), Eye(0.5e-3, 24e-3, 120e-3)
     places, weights = Spectrum.sled(GREEN).every(1e-9)
-    counts = [least_followed(places, weights, t, grid, DISPLAY, eye) for t in (0.1, 0.03, 0.01, 1e-5)]
+    counts = [least_count(places, weights, t, grid, DISPLAY, eye) for t in (0.1, 0.03, 0.01, 1e-5)]
     assert counts == sorted(counts) and counts[0] == 1 and counts[-1] == len(places)
-    light = seen_light(grid, places.mean().item(), DISPLAY, eye)
+    light = pupil_illumination(grid, places.mean().item(), DISPLAY, eye)
     assert neighbour_error(places, weights, counts[2], light) <= 0.01
     assert neighbour_error(places, weights, counts[2] - 1, light) > 0.01
     field = random_phase(grid, torch.complex64)
@@ -74,13 +79,13 @@ def test_rays_find_the_rim_and_the_paths():
     """A hologram far larger than the pupil's view of it lights the whole rim; one far smaller, none of it."""
     wide, narrow = Grid(4096, PITCH), Grid(64, PITCH)
     planar, eye = Display.planar(0.33), Eye(1e-3, 24e-3, 0.3)
-    seen = seen_light(wide, GREEN, planar, eye, reach=1e-4)
-    assert seen.rim == 1.0
+    seen = pupil_illumination(wide, GREEN, planar, eye, reach=1e-4)
+    assert seen.edge == 1.0
     # From the axis the pupil's rim is 1 / 300 away: paths differ by FAR / 2 times its square, off the axis by more.
     assert seen.path_difference == pytest.approx(FAR / 2 * (1.1e-3 / 0.3) ** 2, rel=0.1)
-    assert seen_light(narrow, GREEN, DISPLAY, Eye(3e-3, 24e-3, 120e-3)).rim == 0.0
-    one = seen_light(Grid((1, 64), PITCH), GREEN, planar, eye)
-    assert 0 <= one.rim <= 1 and one.path_difference > 0
+    assert pupil_illumination(narrow, GREEN, DISPLAY, Eye(3e-3, 24e-3, 120e-3)).edge == 0.0
+    one = pupil_illumination(Grid((1, 64), PITCH), GREEN, planar, eye)
+    assert 0 <= one.edge <= 1 and one.path_difference > 0
 
 
 @pytest.mark.parametrize("paraxial", [True, False])
@@ -121,7 +126,7 @@ def test_an_eye_whose_errors_cannot_be_told_from_samples():
     """Its pupil takes more than the band of the picture: every wavelength is followed, and neighbours refuse."""
     eye = Eye(4e-3, 24e-3, 120e-3, chromatic_reference=GREEN)
     places, weights = Spectrum.led(GREEN).every(1e-9)
-    assert least_followed(places, weights, 0.5, GRID, DISPLAY, eye) == len(places)
+    assert least_count(places, weights, 0.5, GRID, DISPLAY, eye) == len(places)
     with pytest.raises(ValueError, match="propagate every wavelength, or use a smaller pupil or a finer grid"):
         next(neighbours(random_phase(), GRID, GREEN, [GREEN], DISPLAY, eye))
 
@@ -209,12 +214,12 @@ def test_gradients_reach_hologram_weights_and_accommodation():
         ({"count": 4}, "count must be at most 3, the number of wavelengths given, got 4"),
         ({"count": None, "tolerance": 0.0}, "tolerance"),
         (
-            {"places": [GREEN, GREEN, 530e-9]},
-            "places must increase, with one weight each, got 3 places, weights \\(3,\\)",
+            {"wavelengths": [GREEN, GREEN, 530e-9]},
+            "wavelengths must increase, with one weight each, got 3 wavelengths, weights \\(3,\\)",
         ),
-        ({"weights": [1.0]}, "got 3 places, weights \\(1,\\)"),
-        ({"places": [-GREEN, GREEN, 530e-9]}, "wavelength"),
-        ({"places": [math.nan, GREEN, 530e-9]}, "wavelength"),
+        ({"weights": [1.0]}, "got 3 wavelengths, weights \\(1,\\)"),
+        ({"wavelengths": [-GREEN, GREEN, 530e-9]}, "wavelength"),
+        ({"wavelengths": [math.nan, GREEN, 530e-9]}, "wavelength"),
         ({"weights": [1.0, math.nan, 1.0]}, "weights"),
         ({"weights": [1.0, -1.0, 1.0]}, "weights"),
         ({"field": torch.ones(3, 3)}, "field"),
@@ -223,7 +228,12 @@ def test_gradients_reach_hologram_weights_and_accommodation():
 )
 def test_bad_input_is_refused(change, message):
     eye = Eye(0.8e-3, 24e-3, 15e-3)
-    given = {"field": random_phase(SMALL), "places": [510e-9, GREEN, 530e-9], "weights": [1.0] * 3, "count": 1} | change
-    words = [given.pop(name) for name in ("field", "places", "weights")]
+    given = {
+        "field": random_phase(SMALL),
+        "wavelengths": [510e-9, GREEN, 530e-9],
+        "weights": [1.0] * 3,
+        "count": 1,
+    } | change
+    words = [given.pop(name) for name in ("field", "wavelengths", "weights")]
     with pytest.raises((ValueError, TypeError), match=message):
         spectral_image(words[0], SMALL, words[1], words[2], NEAR, eye, **given)

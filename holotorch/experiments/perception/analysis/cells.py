@@ -43,8 +43,8 @@ class CellTests:
         if self.two_way:
             tests = (("eccentricity", self.two_way.rows), ("size", self.two_way.columns))
             tests = (*tests, ("interaction", self.two_way.interaction))
-            words = [f"{name} F({t.freedom[0]}, {t.freedom[1]}) = {t.f:.3g}, p = {t.p:.3g}" for name, t in tests]
-            lines.append(f"             two-way in the far periphery: {'; '.join(words)}")
+            parts = [f"{name} F({t.freedom[0]}, {t.freedom[1]}) = {t.f:.3g}, p = {t.p:.3g}" for name, t in tests]
+            lines.append(f"             two-way in the far periphery: {'; '.join(parts)}")
         return lines
 
 

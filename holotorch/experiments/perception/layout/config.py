@@ -14,8 +14,8 @@ ICONS = ("wheel", "coaster", "castle", "boat", "tent", "carousel", "food", "firs
 
 def _no_icon(name: str) -> str:
     hint = nearest(name, list(ICONS))
-    wanted = f"expected {', '.join(map(repr, ICONS))}, or a picture file (PNG, JPEG) that exists"
-    return f"{wanted}, got {short(name)}{hint if 'did you mean' in hint else ''}"
+    expected = f"expected {', '.join(map(repr, ICONS))}, or a picture file (PNG, JPEG) that exists"
+    return f"{expected}, got {short(name)}{hint if 'did you mean' in hint else ''}"
 
 
 Icon = Annotated[str, existing(lambda name: name in ICONS or Path(name).is_file(), _no_icon)]

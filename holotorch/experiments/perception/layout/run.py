@@ -239,9 +239,9 @@ def _legend(layouts: Layouts) -> list[Artist]:
     """Legend entries of the frames in the picture, and of the lines at 40 and 70 deg."""
     used = {_frame(layout, i) for _, layout in layouts.scaled for i in range(len(layout.kept))}
     entries: list[Artist] = [
-        Rectangle((0, 0), 1, 1, fill=False, edgecolor=colour, linestyle=style, label=words)
-        for colour, style, words in (_FITTED, _UNTESTED, _KEPT, _EXTRAPOLATED)
-        if (colour, style, words) in used
+        Rectangle((0, 0), 1, 1, fill=False, edgecolor=colour, linestyle=style, label=label)
+        for colour, style, label in (_FITTED, _UNTESTED, _KEPT, _EXTRAPOLATED)
+        if (colour, style, label) in used
     ]
     ends = f"{FITTED_DEG[0]:g} and {FITTED_DEG[1]:g} deg: where the lines of Table 2.2 begin and end"
     return [*entries, Line2D([], [], color=_LIMITS, linestyle=":", label=ends)]

@@ -44,9 +44,9 @@ def _unit_if_unusual(value: Any) -> Any:
     """Refuse a number without a unit that is unusual in metres: a distance of 21 was probably meant in centimetres."""
     low, high = SCREEN.usual
     if isinstance(value, int | float) and not isinstance(value, bool) and high < value <= SCREEN.high:
-        words = f"a distance in metres, usually {shown(low, 'm')} to {shown(high, 'm')}"
+        expected = f"a distance in metres, usually {shown(low, 'm')} to {shown(high, 'm')}"
         hint = f"write {value:g} cm, or {value:g} m if metres are meant"
-        raise PydanticCustomError("quantity", "expected {words}", {"words": words, "hint": f"; {hint}"})
+        raise PydanticCustomError("quantity", "expected {words}", {"words": expected, "hint": f"; {hint}"})
     return value
 
 

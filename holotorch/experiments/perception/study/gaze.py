@@ -124,8 +124,8 @@ class GazeTrack:
         ``now`` is the time of their arrival; None skips the check of the clock, for samples of a file.
         """
         added = []
-        for each in value if isinstance(value, list) else [value]:
-            sample = _sample(each)
+        for item in value if isinstance(value, list) else [value]:
+            sample = _sample(item)
             if isinstance(sample, str):
                 self.dropped[sample] += 1
             elif now is not None and abs(sample.time - now) > _CLOCK_S:

@@ -56,11 +56,11 @@ class JointViewer(Viewer):
         if coarse:
             return Shown(pictures, numbers, coarse=True)
         proceed()
-        wanted = self._experiment.views([view]).images
-        scores = errors(image, wanted)
+        targets = self._experiment.views([view]).images
+        scores = errors(image, targets)
         numbers |= {"SSIM": f"{scores['ssim']:.3f}", "PSNR": f"{scores['psnr']:.1f} dB"}
         numbers["contrast of speckle"] = f"{scores['contrast']:.3f}"
-        pictures.append(Picture.of("wanted", "Wanted", self._coloured(wanted)))
+        pictures.append(Picture.of("wanted", "Wanted", self._coloured(targets)))
         return Shown(pictures, numbers)
 
     @cached_property

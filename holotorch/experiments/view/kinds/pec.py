@@ -63,7 +63,7 @@ class PECViewer(Viewer):
         if distances:
             near, far = 1e3 * min(distances), 1e3 * max(distances)
             low, high = (end + part * abs(end) for end, part in ((near, -0.5), (far, 0.5)))
-            listed = ", ".join(f"{1e3 * each:g}" for each in distances)
+            listed = ", ".join(f"{1e3 * distance:g}" for distance in distances)
             controls.append(
                 Slider(
                     "distance",
@@ -98,10 +98,10 @@ class PECViewer(Viewer):
             pictures = self._maps(phase if heaters else warm, "rad" if heaters else "degC")
             return Shown(pictures, numbers)
         picture, scores = observed(experiment, phase)
-        words = {"ssim": "SSIM", "psnr": "PSNR"}
+        names = {"ssim": "SSIM", "psnr": "PSNR"}
         for name in experiment.settings.report.metrics:
             if (value := scores[f"{name}_mean"]) is not None:
-                numbers[words[name]] = f"{value:.3f}" if name == "ssim" else f"{value:.1f} dB"
+                numbers[names[name]] = f"{value:.3f}" if name == "ssim" else f"{value:.1f} dB"
         efficiency = [share for share in scores["efficiency"] if share > 0]
         numbers["light in the picture"] = percent(sum(efficiency) / max(1, len(efficiency)))
         return Shown([Picture.of("shown", "On the screen", picture), self._target], numbers)
@@ -109,7 +109,7 @@ class PECViewer(Viewer):
     def _at_distance(self, distance: float | None) -> PECExperiment:
         """The experiment with its image at one distance in millimetres; unchanged for that of the configuration."""
         experiment = self._experiment
-        meant = [1e3 * each for each in experiment.distances]
+        meant = [1e3 * distance for distance in experiment.distances]
         if distance is None or meant == [distance]:
             return experiment
         settings = experiment.settings

@@ -9,7 +9,7 @@ from holotorch.core.complex import intensity
 from holotorch.core.fourier import fft2, ifft2, multiply_even
 from holotorch.core.grid import Grid
 from holotorch.core.operator import Wavelengths
-from holotorch.optics.free_space.kernels import direction_cosine, turns_phasor
+from holotorch.optics.free_space.kernels import cycles_phasor, direction_cosine
 from holotorch.optics.viewing.pupil_views import View, view_padding
 
 
@@ -59,14 +59,14 @@ class Refocuser:
         frames = self._spectrum if frame is None else self._spectrum[frame : frame + 1]
         images = frames.real.new_zeros(len(light), *self.grid.shape)
         for c, wavelength in enumerate(light):
-            kernel = turns_phasor(view.focus * self._axial_frequency(wavelength)).to(frames.dtype)
-            for each in frames:  # one by one, to save memory
-                images[c] += intensity(ifft2(multiply_even(each[c].clone(), kernel), self.grid.shape))
+            kernel = cycles_phasor(view.focus * self._axial_frequency(wavelength)).to(frames.dtype)
+            for spectrum in frames:  # one by one, to save memory
+                images[c] += intensity(ifft2(multiply_even(spectrum[c].clone(), kernel), self.grid.shape))
         return images / len(frames)
 
     def share(self) -> list[float]:
         """Share of the light of each colour that enters the pupil of the last view."""
-        inside, whole = (intensity(each).sum((0, -2, -1)) for each in (self._spectrum, self._fields))
+        inside, whole = (intensity(field).sum((0, -2, -1)) for field in (self._spectrum, self._fields))
         return (inside / whole.clamp(min=1e-30) / math.prod(self.padded.shape)).tolist()
 
     def _within(self, padded: Grid, light: tuple[float, ...], pupil: View) -> Tensor:

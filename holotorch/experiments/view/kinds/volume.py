@@ -85,11 +85,11 @@ class VolumeViewer(Viewer):
         wavelengths = self._experiment.settings.wavelengths
         colours = range(len(wavelengths)) if values["colour"] == "all" else [int(values["colour"])]
         rendering, on = scene.rendering[list(colours)], [wavelengths[c] for c in colours]
-        seen = view_of(values, scene.scale)
+        view = view_of(values, scene.scale)
         images, shares = [], []
         for c in colours:
             light = [wavelengths[c] + 1e-9 * values["shift"]]
-            images.append(pooled(scene.refocusers[c].intensity(seen, light)[0], scene.stride).cpu())
+            images.append(pooled(scene.refocusers[c].intensity(view, light)[0], scene.stride).cpu())
             shares += scene.refocusers[c].share()
         formed = torch.stack(images)
         picture = (formed * best_scale(formed, rendering)[:, None, None]).clamp(0, 1)
@@ -126,10 +126,10 @@ class VolumeViewer(Viewer):
         return Scene(refocusers, rendering, experiment.stride, divisor)
 
 
-def _scores(picture: Tensor, wanted: Tensor) -> dict[str, str]:
+def _scores(picture: Tensor, reference: Tensor) -> dict[str, str]:
     """SSIM and PSNR of pictures [C, h, w] with values from 0 to 1, mean over the colours."""
     numbers = {}
-    if min(wanted.shape[-2:]) >= SSIM_WINDOW:
-        numbers["SSIM to the rendering"] = f"{ssim(picture, wanted, data_range=1.0).mean().item():.3f}"
-    decibels = psnr(picture, wanted, data_range=1.0).mean().item()
+    if min(reference.shape[-2:]) >= SSIM_WINDOW:
+        numbers["SSIM to the rendering"] = f"{ssim(picture, reference, data_range=1.0).mean().item():.3f}"
+    decibels = psnr(picture, reference, data_range=1.0).mean().item()
     return numbers | ({"PSNR": f"{decibels:.1f} dB"} if math.isfinite(decibels) else {})
