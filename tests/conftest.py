@@ -1,3 +1,4 @@
+import gc
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +10,15 @@ import torch
 torch.set_num_threads(1)
 # A job in the background is started with Ctrl-C ignored, and tests of Ctrl-C would wait for ever.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# Modules and tests are objects by the hundred thousand that stay to the end: collecting garbage looks at none of them,
+# neither while they are made nor in the tests.
+gc.disable()
+
+
+def pytest_collection_finish():
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True, scope="session")

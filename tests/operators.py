@@ -194,15 +194,16 @@ UNEVEN = (0.21e-3, 0.26e-3, 0.29e-3)  # depths in metres; the cones of light are
 EVEN = (0.21e-3, 0.25e-3, 0.29e-3)
 
 
-def _hologram(kind: type, cone: str, error: float, stride: int = 1, depths=UNEVEN, **options) -> Case:
-    grid, wavelength = GRID, WAVELENGTHS[0]
-    layer = (-(-GRID.shape[0] // stride), -(-GRID.shape[1] // stride))
+def _hologram(kind: type, cone: str, error: float, stride: int = 1, depths=UNEVEN, grid=GRID, **options) -> Case:
+    wavelength = WAVELENGTHS[0]
+    layer = (-(-grid.shape[0] // stride), -(-grid.shape[1] // stride))
     matrix = cache(lambda: holograms.matrix(layer, grid.shape, grid.pitch, wavelength, depths, cone, stride))
     return Case(
         f"{kind.__name__}, {cone}, stride {stride}, {'even' if depths is EVEN else 'uneven'} depths",
         lambda: kind(grid, wavelength, depths, cone=cone, stride=stride, **options),
         lambda c: matrix(),
         shape=(len(depths), *layer),
+        out_shape=grid.shape,
         channels=(),
         tolerance=error,
         refusal=None,
@@ -335,4 +336,12 @@ CASES = [
     _hologram(AxialHologram, "taper", 1e-3, tolerance=1e-4),
     _hologram(AxialHologram, "taper", 1e-3, stride=2, depths=EVEN, tolerance=1e-4),
     _hologram(AxialHologram, "band", 3e-2, stride=2, tolerance=3e-3),
+]
+# Holograms of few planes for what takes time with each plane, such as compiling.
+SHALLOW = [
+    _hologram(DirectHologram, "box", 1e-11, stride=2, depths=UNEVEN[:1], grid=Grid((5, 7), GRID.pitch)),
+    _hologram(ConvolutionHologram, "full", 1e-11, depths=UNEVEN[:1]),
+    _hologram(ConvolutionHologram, "disc", 1e-11, depths=UNEVEN[:2]),
+    _hologram(ConvolutionHologram, "taper", 1e-6, stride=2, depths=UNEVEN[:1]),
+    _hologram(ConvolutionHologram, "band", 3.8e-3, depths=UNEVEN[:1]),
 ]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import several_runs
 import torch
 from paths import CONFIGS
 from tiny_runs import RUNS, without
@@ -58,10 +59,10 @@ STEPS = {  # long enough to be interrupted
 }
 
 
-def started(count: int, words: list[str], out: Path) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
+def started(*words: str) -> "subprocess.Popen[str]":
+    """Two processes that run a script or a module."""
     return subprocess.Popen(
-        [*command, "-m", "holotorch", "run", *words, "--out", str(out)],
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -69,17 +70,29 @@ def started(count: int, words: list[str], out: Path) -> "subprocess.Popen[str]":
     )
 
 
-@pytest.mark.parametrize("kind", SHARED)
-def test_several_processes_give_what_one_gives(kind, tmp_path):
-    words, arrays = SHARED[kind]
-    assert main(["run", *words, "--out", str(tmp_path / "one")]) == 0
-    job = started(2, words, tmp_path / "two")
+@pytest.fixture(scope="module")
+def run_by_two(tmp_path_factory) -> Path:
+    """Folder with the run of each kind in ``SHARED``, all by one pair of processes."""
+    folder = tmp_path_factory.mktemp("two")
+    runs = [["run", *words, "--out", str(folder / kind)] for kind, (words, _) in SHARED.items()]
+    (folder / "runs.json").write_text(json.dumps(runs))
+    job = started(str(Path(several_runs.__file__)), str(folder / "runs.json"))
     text = job.communicate()[0]
     assert job.returncode == 0, text[-2000:]
+    for kind in SHARED:
+        assert text.count(f"status 0 of {folder / kind}\n") == 2, text[-2000:]
+    return folder
+
+
+@pytest.mark.parametrize("kind", SHARED)
+def test_several_processes_give_what_one_gives(kind, run_by_two, tmp_path):
+    words, arrays = SHARED[kind]
+    folders = tmp_path / "one", run_by_two / kind
+    assert main(["run", *words, "--out", str(folders[0])]) == 0
     for name in arrays:
-        one, two = (np.load(tmp_path / folder / "arrays" / f"{name}.npy") for folder in ("one", "two"))
+        one, two = (np.load(folder / "arrays" / f"{name}.npy") for folder in folders)
         assert np.linalg.norm(one - two) < 1e-6 * np.linalg.norm(one)
-    one, two = (json.loads((tmp_path / folder / "summary.json").read_text()) for folder in ("one", "two"))
+    one, two = (json.loads((folder / "summary.json").read_text()) for folder in folders)
     assert without(two.get("methods", {})) == nearly(without(one.get("methods", {})))
 
 
@@ -95,7 +108,7 @@ def nearly(value):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_a_killed_process_is_reported_and_the_run_goes_on_where_it_was(tmp_path):
     out, words = tmp_path / "run", [*VOLUME, "device=cpu", "report.seeds=100"]
-    job = started(2, words, out)
+    job = started("-m", "holotorch", "run", *words, "--out", str(out))
     while not (out / "checkpoint.pt").is_file():
         assert job.poll() is None, job.communicate()[0][-2000:]
         time.sleep(0.05)
@@ -114,7 +127,7 @@ def test_a_killed_process_is_reported_and_the_run_goes_on_where_it_was(tmp_path)
 @pytest.mark.parametrize("kind", STEPS)
 def test_a_solver_goes_on_where_another_process_was_killed(kind, tmp_path):
     out, words = tmp_path / "run", STEPS[kind]
-    job, text = started(2, words, out), ""
+    job, text = started("-m", "holotorch", "run", *words, "--out", str(out)), ""
     assert job.stdout
     while not re.search(r"\| [1-9]\d*/\d+ \[", text):  # the first steps in the progress bar
         text += (more := job.stdout.read(1))

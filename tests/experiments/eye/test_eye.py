@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -296,6 +297,7 @@ def test_a_scene_that_the_display_cannot_show_is_refused():
         scene_settings(other)
 
 
+@cache
 def _picture(source: str, *changes: str) -> torch.Tensor:
     given = load_config(CONFIG, [*TINY, "eye.tolerance=0.1", *changes])
     eye = observer(given, scene_settings(given))

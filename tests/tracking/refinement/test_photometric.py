@@ -1,6 +1,7 @@
 """The photometric fit on both synthetic renderers, and its derivatives."""
 
 import math
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ SMALL = World(size=(540, 960))
 SIMPLE = Look(noise_dn=0.5, ambient=1.0, highlight=0.0)
 
 
+@lru_cache(maxsize=4)
 def shot(world: World, name: str, look: Look | None = None, depth: float = 0.3, tilt: float = 20.0):
     """Frame [1, 3, H, W], tip and direction [1, 3] of a catheter on a plain table."""
     pose = world.pose(depth, math.radians(tilt))
@@ -33,6 +35,12 @@ def ray_shot(depth: float = 0.3, tilt: float = 20.0, seed: int = 0, **changes):
     changes = {"background": np.full((*SMALL.size, 3), 0.3, np.float32), "tints": np.ones((3, 3))} | changes
     scene = Shot(SMALL.camera, catheter=THESIS, tip=tip.numpy(), direction=direction.numpy(), **changes)
     return take(scene, seed)[None], tip[None], direction[None]
+
+
+@cache
+def ray_shot_at_rest():
+    """The frame that several tests fit, with its tip and direction."""
+    return ray_shot()
 
 
 def distance(found, tip: torch.Tensor) -> float:
@@ -249,7 +257,7 @@ def test_a_texture_behind_the_tube_widens_the_covariance():
 
 
 def test_a_rolling_shutter_widens_the_covariance():
-    frame, tip, direction = ray_shot()
+    frame, tip, direction = ray_shot_at_rest()
     still, rolling = (
         PhotometricFit(SMALL.camera, THESIS, plan=FitPlan(readout=readout))(frame, nudged(tip), direction)
         for readout in (0.0, 1e-3)
@@ -264,7 +272,7 @@ def test_a_rolling_shutter_widens_the_covariance():
 
 @pytest.mark.parametrize("pixels", [-25.0, -12.0, -4.0, 4.0, 12.0, 25.0])
 def test_a_rough_pose_may_be_4_pixels_off_and_one_that_shows_no_edges_is_refused(pixels):
-    frame, tip, direction = ray_shot()
+    frame, tip, direction = ray_shot_at_rest()
     start = tip + pixels * tip.norm() / SMALL.camera.matrix[0, 0] * direction
     found = PhotometricFit(SMALL.camera, THESIS)(frame, start, direction)
     if abs(pixels) < 5:
@@ -274,14 +282,14 @@ def test_a_rough_pose_may_be_4_pixels_off_and_one_that_shows_no_edges_is_refused
 
 
 def test_a_fit_that_has_not_converged_is_nan():
-    frame, tip, direction = ray_shot()
+    frame, tip, direction = ray_shot_at_rest()
     found = PhotometricFit(SMALL.camera, THESIS, plan=FitPlan(iterations=2))(frame, nudged(tip, 1e-3), direction)
     assert bool(found.tip.isnan().all()) and bool(found.covariance.isnan().all()) and bool(found.used.all())
 
 
 def test_an_edge_that_disagrees_is_noticed():
     """A finger over an edge between bands, of which the pose from the other edges knows nothing."""
-    frame, tip, direction = ray_shot()
+    frame, tip, direction = ray_shot_at_rest()
     centre = SMALL.camera.project(tip + 0.1095 * direction)[0].numpy()
     along = SMALL.camera.project(tip + 0.12 * direction)[0].numpy() - centre
     across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
