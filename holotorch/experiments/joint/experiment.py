@@ -186,11 +186,14 @@ class JointExperiment:
     def trained(self) -> Views:
         """The views that are corrected: the stack, and parts of the pupil for the parallax."""
         count = self.settings.eye.parallax
-        return self.with_parts(count) if count else self.stack
+        return self.with_parts(self.parts(count)) if count else self.stack
 
-    def with_parts(self, count: int) -> Views:
-        """The whole pupil at every corrected focus, and ``count`` parts of it with random foci."""
-        parts = pupils.corrected_parts(self.foci, self.radius, count, self.settings.seed + _VIEWS_SEED)
+    def parts(self, count: int) -> list[View]:
+        """Parts of the pupil with random foci, in turn circles and pupils that an edge cuts."""
+        return pupils.corrected_parts(self.foci, self.radius, count, self.settings.seed + _VIEWS_SEED)
+
+    def with_parts(self, parts: list[View]) -> Views:
+        """The whole pupil at every corrected focus, and parts of it."""
         return self.views([View(focus, self.radius) for focus in self.foci] + parts)
 
     def at_foci(self, foci: list[float]) -> Views:
