@@ -24,9 +24,9 @@ from holotorch.correction import (
 from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.joint import budget as shares
-from holotorch.experiments.joint import pupils
 from holotorch.experiments.joint.config import FOCI_PER_STEP, JointSettings, volume_settings
-from holotorch.experiments.joint.sampled import Group, SampledViews
+from holotorch.experiments.joint.views import pupils
+from holotorch.experiments.joint.views.sampled import Group, SampledViews
 from holotorch.experiments.planning.correction import PROPAGATION, measured_crosstalk
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.runs.processes import SharedIntensity, process_count

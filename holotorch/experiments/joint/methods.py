@@ -9,7 +9,7 @@ from holotorch.core.complex import intensity
 from holotorch.correction import deconvolve, gerchberg_saxton, iterative_pec
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.joint.experiment import JointExperiment
-from holotorch.experiments.joint.sampled import Group
+from holotorch.experiments.joint.views.sampled import Group
 from holotorch.experiments.runs.processes import added, process_count
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics.viewing.pupil_views import PupilViews

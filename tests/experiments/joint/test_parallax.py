@@ -10,13 +10,13 @@ from paths import CONFIGS
 from tiny_runs import VOLUME, command
 
 from holotorch.cli import main
-from holotorch.experiments.joint import pupils
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.evaluation import evaluate
 from holotorch.experiments.joint.experiment import build
 from holotorch.experiments.joint.methods import show
 from holotorch.experiments.joint.plan import plan_values
-from holotorch.experiments.joint.sampled import Group, SampledViews
+from holotorch.experiments.joint.views import pupils
+from holotorch.experiments.joint.views.sampled import Group, SampledViews
 from holotorch.experiments.registry import load_config
 
 FOCI, RADIUS = [6e-3, 8e-3, 11e-3], 0.02
