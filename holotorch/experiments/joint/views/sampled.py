@@ -10,10 +10,10 @@ from holotorch.correction import PECProblem
 
 
 class Group(NamedTuple):
-    """Views, by their indices, of which each step takes ``count``."""
+    """Views, by their indices, of which each step takes ``taken``."""
 
     views: Sequence[int]
-    count: int
+    taken: int
 
 
 class SampledViews:
@@ -38,7 +38,7 @@ class SampledViews:
         self._drawn = self._problem([view for group in self._groups for view in self._order(group, step)])
 
     def _order(self, group: Group, step: int) -> Iterator[int]:
-        for place in range(step * group.count, (step + 1) * group.count):
+        for place in range(step * group.taken, (step + 1) * group.taken):
             again, k = divmod(place, len(group.views))
             generator = torch.Generator().manual_seed(self._seed + again)
             yield group.views[int(torch.randperm(len(group.views), generator=generator)[k])]
