@@ -14,7 +14,7 @@ from holotorch.experiments.runs.processes import added, process_count
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics.viewing.pupil_views import PupilViews
 
-_CIRCLES = 64  # smaller pupils of the light field
+CIRCLES = 64  # smaller pupils of the light field
 STEPS_OF_ADAM = 3  # of some of the views, for each step of L-BFGS with all
 
 SHARED = ("unheated", "light_field", "slabs")  # methods whose work several processes divide
@@ -68,8 +68,8 @@ def _unheated(experiment: JointExperiment) -> Tensor:
 def _light_field(experiment: JointExperiment) -> Tensor:
     """One random view in each step: a focus of the whole pupil or, as often, a circle within it."""
     cold = ThermalCrosstalk(0.0).to(experiment.device)
-    views, foci = experiment.with_parts(experiment.parts(2 * _CIRCLES)[::2]), len(experiment.foci)
-    group = Group([*(k % foci for k in range(_CIRCLES)), *range(foci, foci + _CIRCLES)], 1)
+    views, foci = experiment.with_parts(experiment.parts(2 * CIRCLES)[::2]), len(experiment.foci)
+    group = Group([*(k % foci for k in range(CIRCLES)), *range(foci, foci + CIRCLES)], 1)
     steps = experiment.settings.steps * (STEPS_OF_ADAM if experiment.settings.eye.per_step is None else 1)
     start = experiment.kinoform(experiment.random_fields(), cold)
     loss = experiment.sampled(cold, views, [group], None)

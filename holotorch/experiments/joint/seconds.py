@@ -7,6 +7,7 @@ import torch
 from holotorch.experiments.joint.budget import PATIENCE
 from holotorch.experiments.joint.config import FOCI_PER_STEP
 from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.joint.methods import CIRCLES
 from holotorch.experiments.joint.pictures import SWEEP
 from holotorch.experiments.planning.machine import Machine
 
@@ -27,7 +28,7 @@ _STEPS_OF = {
     "random": 0.0,
     "afterwards": 0.0,
     "unheated": 1.0,
-    "light_field": 1.0,
+    "light_field": 0.6,
     "retrieved": 0.7,
     "retrieved_pec": 1.2,
     "slabs": 0.4,
@@ -79,6 +80,7 @@ def seconds_of(experiment: JointExperiment, machine: Machine) -> dict[str, float
     wanted = 7 * planes - 1 + settings.eye.parallax + sweep
     scores = machine.score(colours * planes * pixels, double=False) * scored / planes
     evaluated = _SHOWN * fields * scored * transform + scores
+    wanted += CIRCLES if "light_field" in settings.report.baselines else 0
     others, shown = settings.report.baselines, 2 + len(settings.report.baselines)
     pictures = 2 * _SWEEP_PIXEL * pixels * max(1, 2 * sweep - 2) + _PANEL * shown * (planes + 4)
     return {

@@ -24,6 +24,7 @@ from holotorch.experiments.joint.evaluation import evaluate
 from holotorch.experiments.joint.experiment import JointExperiment, build
 from holotorch.experiments.joint.methods import STEPS_OF_ADAM, Shown, baseline, show
 from holotorch.experiments.joint.names import NAMES
+from holotorch.experiments.joint.views.pupils import APART, TURNED_DEG
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs.figures import figure_png, mark_choice, pareto_front
 from holotorch.io.bundled import find_config
@@ -201,6 +202,11 @@ def _light(amount: Amount) -> Iterator[dict[str, Any]]:
 
 def _verdict(rows: list[dict[str, Any]], memory: list[dict[str, Any]], amount: Amount) -> list[str]:
     setup = f"One colour (520 nm), {amount.size} px, {amount.steps} steps; mean (worst) of {len(amount.seeds)} seed(s)"
+    apart = (
+        f"half pupils and circles are given to no method: corrected edges are at least {TURNED_DEG} degrees from those "
+        f"of the halves, centres of corrected circles {APART:g} radii of the pupil from theirs; Gerchberg-Saxton is "
+        "left out with 24 frames, which it retrieves one by one, with parts of a pupil, and at 2 pi: it knows no limit"
+    )
     lines = []
     for scene in amount.scenes:
         for case in amount.cases:
@@ -219,7 +225,7 @@ def _verdict(rows: list[dict[str, Any]], memory: list[dict[str, Any]], amount: A
         for method in dict.fromkeys(row["method"] for row in memory):
             chosen = [row for row in memory if (row["scene"], row["method"]) == (scene, method)]
             lines.append(f"{scene}, {method} (time constant of half a frame): stack {_spread(chosen, 'stack_psnr')} dB")
-    return [lines[0], f"{setup}; PSNR of intensity:", *lines[1:]]
+    return [lines[0], f"{setup}; PSNR of intensity; {apart}:", *lines[1:]]
 
 
 def _spread(rows: list[dict[str, Any]], key: str, digits: int = 1) -> str:

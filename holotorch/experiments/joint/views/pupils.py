@@ -12,8 +12,8 @@ SIDES = ((0.0, 1.0), (0.0, -1.0))  # (y, x) towards what is covered of the left 
 _RADII = 0.3, 0.7  # of the smaller circles, in radii of the pupil
 _HELD = 0.5  # radius of the circles that are held back, and distance of their centres from that of the pupil
 _DIAGONALS = math.pi / 4, 5 * math.pi / 4  # directions of these centres, from the x axis
-_APART = 0.15  # least distance of the centre of a corrected circle from these centres, in radii of the pupil
-_TURNED = math.radians(15)  # least angle between a corrected edge and those of the left and right halves
+APART = 0.15  # least distance of the centre of a corrected circle from these centres, in radii of the pupil
+TURNED_DEG = 15  # least angle between a corrected edge and those of the left and right halves
 
 
 def halves(foci: Sequence[float], radius: float) -> list[View]:
@@ -47,14 +47,14 @@ def _circles(foci: Sequence[float], radius: float, seed: int) -> Iterator[View]:
         small = _RADII[0] + (_RADII[1] - _RADII[0]) * size
         r, a = (1 - small) * math.sqrt(distance), 2 * math.pi * angle
         y, x = r * math.sin(a), r * math.cos(a)
-        if min(math.dist((y, x), each) for each in _held_centres()) >= _APART:
+        if min(math.dist((y, x), each) for each in _held_centres()) >= APART:
             yield View(_between(foci, focus), radius * small, (radius * y, radius * x))
 
 
 def _edges(foci: Sequence[float], radius: float, seed: int) -> Iterator[View]:
     for turn, focus in _sobol(2, seed):
         side, within = divmod(2 * turn, 1)
-        angle = math.pi * side + _TURNED + (math.pi - 2 * _TURNED) * within
+        angle = math.radians(180 * side + TURNED_DEG + (180 - 2 * TURNED_DEG) * within)
         yield View(_between(foci, focus), radius, covered=(math.sin(angle), math.cos(angle)))
 
 
