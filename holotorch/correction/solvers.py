@@ -1,5 +1,6 @@
 """First-order solvers: accelerated proximal gradient and projected Adam."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -87,17 +88,22 @@ class ProjectedAdam(Solver):
     """Adam with a projection after every step (Kingma and Ba 2015).
 
     The loss may rise in a step, and the result is the last point, not the best one. Each step evaluates the objective
-    once.
+    once. An objective that changes from step to step, such as one of views that are drawn at random, has a method
+    ``at_step``, which is called with the number of the step before it.
 
     Attributes:
         learning_rate: Step length in the unit of the unknown.
         betas: Decay rates of the running means of the gradient and of its square.
+        final: Fraction in (0, 1] of the learning rate that the last of ``max_steps`` approaches, along half a cosine;
+            1 keeps the rate. An objective that changes needs it, since its gradient does not vanish. A run is resumed
+            with the same ``max_steps``.
 
     The other attributes, the call and the errors are those of :class:`Solver`.
     """
 
     learning_rate: float = 0.1
     betas: tuple[float, float] = (0.9, 0.999)
+    final: float = 1.0
     max_steps: int = 400
     tolerance: float = 1e-3
     patience: int = 10
@@ -107,6 +113,8 @@ class ProjectedAdam(Solver):
         checks.positive("learning_rate", self.learning_rate)
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"betas must be at least 0 and below 1, got {self.betas!r}")
+        if not 0 < checks.finite("final", self.final) <= 1:
+            raise ValueError(f"final must be above 0 and at most 1, got {self.final!r}")
 
     def _begin(self, run: Run) -> State:
         return {"gradient": run.gradient, "mean": torch.zeros_like(run.x), "square": torch.zeros_like(run.x)}
@@ -116,8 +124,12 @@ class ProjectedAdam(Solver):
         square = square + (1 - self.betas[1]) * (gradient.square() - square)
         step = run.step + 1
         scale = torch.sqrt(square / (1 - self.betas[1] ** step)) + 1e-8
-        x = run.project(run.x - self.learning_rate / (1 - self.betas[0] ** step) * mean / scale)
+        cosine = (1 + math.cos(math.pi * run.step / self.max_steps)) / 2
+        rate = self.learning_rate * (self.final + (1 - self.final) * cosine)
+        x = run.project(run.x - rate / (1 - self.betas[0] ** step) * mean / scale)
         x = torch.where(run.expanded(run.active), x, run.x)
+        if at_step := getattr(run.objective, "at_step", None):
+            at_step(step)
         loss, gradient = run.value_and_gradient(x)
         run.advance(x, loss, ~torch.isfinite(loss))
         return {"gradient": gradient, "mean": mean, "square": square}

@@ -220,6 +220,7 @@ def test_apg_says_stalled_when_no_step_is_accepted_and_keeps_what_it_has():
         (lambda: APG(tolerance=float("nan")), "tolerance must be (at least zero|finite)"),
         (lambda: ProjectedAdam(learning_rate=-0.1), "learning_rate must be above zero"),
         (lambda: ProjectedAdam(patience=0), "at least 1"),
+        (lambda: ProjectedAdam(final=0.0), "final must be above 0 and at most 1"),
         (lambda: APG(grow=0.5), "grow must be at least 1"),
         (lambda: LBFGS(memory=0), "memory must be at least 1"),
         (lambda: LBFGS(first=0.0), "first must be above zero"),
@@ -252,3 +253,25 @@ def test_a_step_reads_one_number_back(solver, weights):
         )
     steps = [(after[1] - before[1]) for before, after in pairwise(seen) if after[0] - before[0] == single]
     assert len(steps) > 10 and set(steps) == {1}
+
+
+class _Drawn:
+    """The squared distance from one of two points, another one in each step."""
+
+    def __init__(self):
+        self.steps: list[int] = []
+
+    def at_step(self, step: int) -> None:
+        self.steps.append(step)
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        return (x - (1.0 if len(self.steps) % 2 else 3.0)).square().sum((-2, -1))
+
+
+def test_a_falling_learning_rate_settles_between_the_minima_of_an_objective_that_changes():
+    start, rest = torch.full((1, 4, 4), 2.5, dtype=torch.float64), {"max_steps": 200, "tolerance": 0.0}
+    changed = _Drawn()
+    settled = ProjectedAdam(0.2, final=0.01, **rest)(changed, start).x
+    assert changed.steps == list(range(1, 201))
+    restless = ProjectedAdam(0.2, **rest)(_Drawn(), start).x
+    assert (settled - 2).abs().max() < 0.02 < (restless - settled).abs().max()

@@ -44,6 +44,7 @@ WEIGHTED = [str(CONFIGS / "pec" / "peripheral.yaml"), *PEC[1:], "solver.max_step
 JOINT = [str(CONFIGS / RUNS["joint"][0]), *RUNS["joint"][1:]]
 COLOURS = [*JOINT, "frames=1", "display.planes=1", "report.baselines=[unheated]"]
 HEATED = [*JOINT, "heat={frame_us: 20, time_constant_us: 10}", "report.baselines=[afterwards, slabs]"]
+SAMPLED = [*JOINT, "eye={parallax: 4, per_step: 2}", "report.baselines=[unheated, light_field]"]
 SHARED = {
     "volume": ([*VOLUME, "device=cpu"], ["hologram", "refocused"]),
     "eye": ([*EYE, "seeds=1"], ["retina", "reference"]),
@@ -52,6 +53,7 @@ SHARED = {
     "pec, weighted": (WEIGHTED, ["phase", "intensity"]),
     "joint, colours": (COLOURS, ["phase", "shown"]),
     "joint, frames": (HEATED, ["phase", "shown"]),
+    "joint, random views": (SAMPLED, ["phase", "shown"]),
 }
 STEPS = {  # long enough to be interrupted
     "pec": [*PEC, "solver.max_steps=400", "solver.patience=400", "report.baselines=[]"],

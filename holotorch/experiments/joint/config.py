@@ -24,7 +24,8 @@ from holotorch.experiments.volume.config import Depth, TransferSettings, ViewSet
 
 REFERENCE = 630e-9  # metres, wavelength of ``display.rad_per_K``
 PLANES = 5  # number of planes of a run without tolerance, if it is not stated
-Baseline = Literal["random", "afterwards", "unheated", "retrieved", "retrieved_pec", "slabs"]
+FOCI_PER_STEP = 2  # foci of the whole pupil that each step takes, if it takes some of the views
+Baseline = Literal["random", "afterwards", "unheated", "light_field", "retrieved", "retrieved_pec", "slabs"]
 
 
 class DisplaySettings(GridSettings):
@@ -54,14 +55,17 @@ class EyeSettings(Settings):
     """The eye, which looks from far away and may focus on every depth.
 
     ``pupil``: radius of the pupil, relative to the largest sine that the array emits at the shortest wavelength;
-    pixels resolve the image up to 0.5. ``parallax``: number of smaller pupils, at random positions within the pupil and
-    with random foci, that are corrected too, so that the image also holds for parts of the pupil.
+    pixels resolve the image up to 0.5. ``parallax``: number of parts of the pupil, with random foci, that are corrected
+    too, so that the image also holds for parts of the pupil: in turn smaller circles and pupils that an edge covers by
+    half. ``per_step``: number of these parts, and of two foci of the whole pupil, that each step takes at random, so
+    that there may be many parts; by default each step takes all.
     ``occlusion``: for all pupils, planes occlude each other as along the axis (``axis``), or for each pupil as in its
     directions (``pupil``).
     """
 
     pupil: Annotated[Number, Field(gt=0, le=1)] = 0.5
     parallax: Annotated[int, BeforeValidator(number), Field(ge=0, le=1000)] = 0
+    per_step: Count | None = None
     occlusion: Literal["axis", "pupil"] = "axis"
 
 
@@ -77,7 +81,8 @@ class JointReport(Settings):
 
     ``random``: an ideal display of complex fields with random phases, averaged over the frames. ``afterwards``: the
     phases of such fields, corrected for the heat frame by frame. ``unheated``: optimised for the same views without
-    heat, then corrected for it. ``retrieved``: Gerchberg-Saxton phase retrieval over all views, heat ignored;
+    heat, then corrected for it. ``light_field``: the same by Adam for a single random view in each step, a whole pupil
+    or a smaller one. ``retrieved``: Gerchberg-Saxton phase retrieval over all views, heat ignored;
     ``retrieved_pec``: the same with a deconvolution in each pass (thesis Algorithm 1). ``slabs``: each frame shows one
     plane of the volume, as in thesis Fig. 4.18.
     """
@@ -89,7 +94,8 @@ class JointSettings(Settings):
     """A volume shown by ``frames`` heater patterns in turn, optimised together for what an eye sees at every focus.
 
     One wavelength shows the mean of the volume's colours, three show red, green and blue, others share these as in runs
-    of kind volume. ``steps``: largest number of L-BFGS steps. ``light_weight``: weight of the light that misses the
+    of kind volume. ``steps``: largest number of steps, of L-BFGS, or of Adam where each step takes other views
+    (``eye.per_step``), which are shorter and more. ``light_weight``: weight of the light that misses the
     pupil or the window, against the error of the images.
     ``heat``: heat that is left from earlier frames is part of the model; by default each frame starts cold.
     ``tolerance``: allowed relative L2 error of the images, divided between the taps of the heat kernel, the planes
@@ -169,4 +175,18 @@ def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
         chosen = "baselines" in settings.report.model_fields_set
         words = f"the comparison 'slabs' shows one plane a frame, here {planes} planes, got {settings.frames} frames"
         problems.append((("report", "baselines") if chosen else ("frames",), f"{words}; {cure}"))
+    return problems + _sampling(settings)
+
+
+def _sampling(settings: JointSettings) -> list[tuple[Key, str]]:
+    """What contradicts steps that take some of the views each."""
+    eye, problems = settings.eye, list[tuple[Key, str]]()
+    if eye.per_step is None:
+        return problems
+    if eye.per_step > eye.parallax:
+        message = f"expected at most the {eye.parallax} parts of eye.parallax, got {eye.per_step}"
+        problems.append((("eye", "per_step"), message))
+    if settings.tolerance is not None:
+        message = "a tolerance stops a solver whose views are the same in each step; leave eye.per_step or it out"
+        problems.append((("tolerance",), message))
     return problems

@@ -21,7 +21,8 @@ def evaluate(experiment: JointExperiment, shown: Shown) -> tuple[dict[str, Any],
     One scale for each colour, that of the stack, is used for all views, since the power of a laser does not depend on
     where the eye looks.
     """
-    views = {"stack": experiment.stack, "held": experiment.held_back, "half": experiment.halves}
+    views = {"stack": experiment.stack, "held": experiment.held_back}
+    views |= {"half": experiment.halves, "part": experiment.held_parts}
     images, numbers = {}, {}
     scale = torch.ones(())
     with torch.no_grad():
@@ -62,7 +63,8 @@ def per_view(experiment: JointExperiment, shown: Shown) -> tuple[Tensor, Tensor,
 
     With the rows, anybody can compute the same pictures from the phases: focus, pupil in cycles per metre, wavelength.
     """
-    sets = [("trained", experiment.trained), ("held", experiment.held_back), ("held", experiment.halves)]
+    held = experiment.held_back, experiment.halves, experiment.held_parts
+    sets = [("trained", experiment.trained), *(("held", views) for views in held)]
     wavelengths, (pitch_y, pitch_x) = experiment.settings.wavelengths, experiment.grid.pitch
     wanted, images, rows = [], [], []
     with torch.no_grad():
@@ -73,7 +75,6 @@ def per_view(experiment: JointExperiment, shown: Shown) -> tuple[Tensor, Tensor,
                 continue
             observed = shown.images(views.operator) * scale
             for v, view in enumerate(views.operator.views):
-                half = {1.0: "left", -1.0: "right"}.get(view.covered[1], "")
                 for c, wavelength in enumerate(wavelengths):
                     numbers = errors(observed[c : c + 1, v : v + 1], views.images[c : c + 1, v : v + 1])
                     y, x, radius = (sine / wavelength for sine in (*view.centre, view.radius))
@@ -85,7 +86,8 @@ def per_view(experiment: JointExperiment, shown: Shown) -> tuple[Tensor, Tensor,
                             "pupil_y_per_m": y,
                             "pupil_x_per_m": x,
                             "pupil_radius_per_m": radius,
-                            "half": half,
+                            "covered_y": view.covered[0],
+                            "covered_x": view.covered[1],
                             "wavelength_m": wavelength,
                             "pitch_y_m": pitch_y,
                             "pitch_x_m": pitch_x,

@@ -12,11 +12,21 @@ from torch import Tensor
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
-from holotorch.correction import LBFGS, PECProblem, Solution, deconvolve, limit_peak_phase, spread_preconditioner
+from holotorch.correction import (
+    LBFGS,
+    PECProblem,
+    ProjectedAdam,
+    Solution,
+    deconvolve,
+    limit_peak_phase,
+    spread_preconditioner,
+)
 from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.joint import budget as shares
-from holotorch.experiments.joint.config import JointSettings, volume_settings
+from holotorch.experiments.joint.config import FOCI_PER_STEP, JointSettings, volume_settings
+from holotorch.experiments.joint.views import pupils
+from holotorch.experiments.joint.views.sampled import Group, SampledViews
 from holotorch.experiments.planning.correction import PROPAGATION, measured_crosstalk
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.runs.processes import SharedIntensity, process_count
@@ -33,6 +43,9 @@ _PENALTY_FROM = 0.985  # fraction of the limit above which phases are penalised,
 _TOLERANCE = 3e-3  # relative L2 error of the fields that the start is made of
 _RINGS = 2  # rings of directions within a pupil, for the occlusion between planes
 _VIEWS_SEED = 1 << 40  # added to the seed for the random pupils, so that they are independent of the start
+_LEARNING_RATE = 0.15  # rad, of Adam
+_BETAS = 0.9, 0.99  # of Adam; its square of the gradient follows that of about 100 steps
+_FINAL = 0.01  # learning rate of the last step relative to the first
 
 
 @dataclass(frozen=True)
@@ -46,6 +59,10 @@ class Views:
 
     operator: PupilViews
     images: Tensor
+
+    def select(self, indices: Sequence[int]) -> "Views":
+        """Some of the views, by their indices."""
+        return Views(self.operator.select(indices), self.images[:, list(indices)])
 
 
 @dataclass(frozen=True)
@@ -158,21 +175,26 @@ class JointExperiment:
     @cached_property
     def halves(self) -> Views:
         """The left and the right half of the pupil at every corrected focus, which no method is given."""
-        sides = ((0.0, 1.0), (0.0, -1.0))
-        return self.views([View(focus, self.radius, covered=side) for focus in self.foci for side in sides])
+        return self.views(pupils.halves(self.foci, self.radius))
+
+    @cached_property
+    def held_parts(self) -> Views:
+        """Circles within the pupil at every corrected focus, which no method is given."""
+        return self.views(pupils.held_parts(self.foci, self.radius))
 
     @cached_property
     def trained(self) -> Views:
-        """The views that are corrected: the stack, and smaller pupils for the parallax."""
-        generator = torch.Generator().manual_seed(self.settings.seed + _VIEWS_SEED)
-        views = [View(focus, self.radius) for focus in self.foci]
-        for _ in range(self.settings.eye.parallax):
-            size, distance, angle, focus = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
-            radius = self.radius * (0.3 + 0.4 * size)
-            r, a = (self.radius - radius) * math.sqrt(distance), 2 * math.pi * angle
-            depth = self.foci[0] + focus * (self.foci[-1] - self.foci[0])
-            views.append(View(depth, radius, (r * math.sin(a), r * math.cos(a))))
-        return self.views(views) if self.settings.eye.parallax else self.stack
+        """The views that are corrected: the stack, and parts of the pupil for the parallax."""
+        count = self.settings.eye.parallax
+        return self.with_parts(self.parts(count)) if count else self.stack
+
+    def parts(self, count: int) -> list[View]:
+        """Parts of the pupil with random foci, in turn circles and pupils that an edge cuts."""
+        return pupils.corrected_parts(self.foci, self.radius, count, self.settings.seed + _VIEWS_SEED)
+
+    def with_parts(self, parts: list[View]) -> Views:
+        """The whole pupil at every corrected focus, and parts of it."""
+        return self.views([View(focus, self.radius) for focus in self.foci] + parts)
 
     def at_foci(self, foci: list[float]) -> Views:
         """The whole pupil at focal distances in metres."""
@@ -293,18 +315,52 @@ class JointExperiment:
         return deconvolve(crosstalk, fields.angle() % (2 * math.pi) + math.pi)
 
     def solver(self, crosstalk: ThermalCrosstalk) -> LBFGS:
-        """L-BFGS with the preconditioner of the heat kernel."""
+        """L-BFGS with the preconditioner of the heat kernel, for views that are the same in each step."""
         rule = {"tolerance": shares.stop(self.settings, self.budget), "patience": shares.PATIENCE}
         return LBFGS(max_steps=self.settings.steps, precondition=spread_preconditioner(crosstalk.kernel), **rule)
+
+    def optimise(
+        self,
+        heat: ThermalCrosstalk | HeatCycle,
+        crosstalk: ThermalCrosstalk,
+        limit: float | None,
+        progress: Callback | None = None,
+        resume: State | None = None,
+    ) -> Solution:
+        """Heater phases for the trained views and a model of the heat, from the kinoforms of random fields.
+
+        All processes of a run must call this.
+        """
+        start = self.kinoform(self.random_fields(), crosstalk).to(self.dtype)
+        per_step = self.settings.eye.per_step
+        if per_step is None:
+            problem = self.problem(heat, self.trained, limit, shared=True)
+            return self.solver(crosstalk)(problem, start, callback=progress, resume=resume)
+        whole, parts = range(len(self.foci)), range(len(self.foci), len(self.trained.operator.views))
+        groups = [Group(whole, min(FOCI_PER_STEP, len(whole))), Group(parts, per_step)]
+        loss = self.sampled(heat, self.trained, groups, limit)
+        return self.adam(self.settings.steps)(loss, start, callback=progress, resume=resume)
+
+    def sampled(
+        self, heat: ThermalCrosstalk | HeatCycle, views: Views, groups: Sequence[Group], limit: float | None
+    ) -> SampledViews:
+        """The loss of views of which each step takes some of each group at random, computed by all processes."""
+
+        def problem(drawn: list[int]) -> PECProblem:
+            return self.problem(heat, views.select(drawn), limit, shared=True)
+
+        return SampledViews(problem, groups, self.settings.seed + _VIEWS_SEED)
+
+    def adam(self, steps: int) -> ProjectedAdam:
+        """The solver for views that are drawn at random in each step."""
+        return ProjectedAdam(_LEARNING_RATE, _BETAS, _FINAL, max_steps=steps, tolerance=0.0)
 
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
         """Heater phases [F, C, H, W] that form all views at once, from the kinoforms of random fields.
 
         All processes of a run must call this.
         """
-        problem = self.problem(self.heat, self.trained, self.settings.limit, shared=True)
-        start = self.kinoform(self.random_fields(), self.crosstalk).to(self.dtype)
-        return self.solver(self.crosstalk)(problem, start, callback=progress, resume=resume)
+        return self.optimise(self.heat, self.crosstalk, self.settings.limit, progress, resume)
 
     def within_limit(self, phase: Tensor) -> Tensor:
         """Heater phases scaled down where a phase after spreading exceeds the limit."""

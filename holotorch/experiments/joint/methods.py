@@ -9,11 +9,15 @@ from holotorch.core.complex import intensity
 from holotorch.correction import deconvolve, gerchberg_saxton, iterative_pec
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.joint.views.sampled import Group
 from holotorch.experiments.runs.processes import added, process_count
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics.viewing.pupil_views import PupilViews
 
-SHARED = ("unheated", "slabs")  # methods whose work several processes divide
+CIRCLES = 64  # smaller pupils of the light field
+STEPS_OF_ADAM = 3  # of some of the views, for each step of L-BFGS with all
+
+SHARED = ("unheated", "light_field", "slabs")  # methods whose work several processes divide
 
 
 @dataclass(frozen=True)
@@ -51,13 +55,29 @@ def baseline(experiment: JointExperiment, name: str) -> Shown:
         return show(experiment, experiment.kinoform(experiment.random_fields(), experiment.crosstalk))
     if name == "unheated":
         return show(experiment, _unheated(experiment))
+    if name == "light_field":
+        return show(experiment, _light_field(experiment))
     return _slabs(experiment) if name == "slabs" else show(experiment, _retrieved(experiment, name == "retrieved_pec"))
 
 
 def _unheated(experiment: JointExperiment) -> Tensor:
     cold = ThermalCrosstalk(0.0).to(experiment.device)
-    problem = experiment.problem(cold, experiment.trained, None, shared=True)
-    phase = experiment.solver(cold)(problem, experiment.kinoform(experiment.random_fields(), cold)).x
+    return _corrected(experiment, experiment.optimise(cold, cold, None).x)
+
+
+def _light_field(experiment: JointExperiment) -> Tensor:
+    """One random view in each step: a focus of the whole pupil or, as often, a circle within it."""
+    cold = ThermalCrosstalk(0.0).to(experiment.device)
+    views, foci = experiment.with_parts(experiment.parts(2 * CIRCLES)[::2]), len(experiment.foci)
+    group = Group([*(k % foci for k in range(CIRCLES)), *range(foci, foci + CIRCLES)], 1)
+    steps = experiment.settings.steps * (STEPS_OF_ADAM if experiment.settings.eye.per_step is None else 1)
+    start = experiment.kinoform(experiment.random_fields(), cold)
+    loss = experiment.sampled(cold, views, [group], None)
+    return _corrected(experiment, experiment.adam(steps)(loss, start).x)
+
+
+def _corrected(experiment: JointExperiment, phase: Tensor) -> Tensor:
+    """Heater phases for phases that were optimised without heat."""
     return deconvolve(experiment.crosstalk, phase % (2 * torch.pi) + torch.pi)
 
 

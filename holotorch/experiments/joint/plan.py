@@ -8,12 +8,13 @@ import torch
 from holotorch.experiments.joint.budget import PATIENCE, stop
 from holotorch.experiments.joint.config import REFERENCE, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
-from holotorch.experiments.joint.seconds import seconds_of, view_samples
+from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.volume.plan import dark_picture
 from holotorch.optics.light.coherence import depth_of_focus
 
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
+_KERNEL_BYTES = 8  # bytes per padded sample of a view of a colour, of the transfer functions of all views
 _BASE_BYTES = 430e6  # memory of the libraries
 _SPACING = 0.75  # of planes, in depths of focus, above which foci between them are worse (10 dB at 0.94)
 
@@ -21,10 +22,12 @@ _SPACING = 0.75  # of planes, in depths of focus, above which foci between them 
 def plan_values(experiment: JointExperiment) -> dict[str, Any]:
     """Cost and physics as plain JSON values."""
     settings, foci, padded = experiment.settings, experiment.foci, view_samples(experiment)
-    views = len(foci) + settings.eye.parallax
-    transforms = settings.frames * len(settings.wavelengths) * views
+    eye, colours = settings.eye, len(settings.wavelengths)
+    views = len(foci) + eye.parallax
+    samples = settings.frames * colours * step_views(experiment)
+    kernels = 0 if eye.per_step is None else _KERNEL_BYTES * colours * views  # of views that few steps take
     seconds = seconds_of(experiment, machine_speed(experiment.device))
-    peak = _BASE_BYTES + _SAMPLE_BYTES * transforms * math.prod(padded) + experiment.scene.volume.values.nbytes
+    peak = _BASE_BYTES + (_SAMPLE_BYTES * samples + kernels) * math.prod(padded) + experiment.scene.volume.values.nbytes
     return {
         "volume": {"shape": list(experiment.scene.volume.shape), "synthetic": experiment.scene.synthetic},
         "foci_mm": [focus * 1e3 for focus in foci],
@@ -66,9 +69,8 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"frame(s) in turn; {spread}, phases up to "
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient{memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
-        f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",
-        f"Solver     L-BFGS, {_steps(values, settings)}; compared with "
-        f"{', '.join(settings.report.baselines) or 'nothing'}",
+        f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the pupil",
+        f"Solver     {_steps(values, experiment)}; compared with {', '.join(settings.report.baselines) or 'nothing'}",
         f"{experiment.budget.text}; {values['taps']} taps, {values['precision']} in the solver",
         f"Cost       about {values['predicted_seconds']:.2g} s ({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
@@ -76,11 +78,14 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     return "\n".join(lines + [f"Note       {note}" for note in values["notes"]])
 
 
-def _steps(values: dict[str, Any], settings: JointSettings) -> str:
+def _steps(values: dict[str, Any], experiment: JointExperiment) -> str:
+    settings = experiment.settings
+    if settings.eye.per_step is not None:
+        return f"Adam, {settings.steps} steps, each with {step_views(experiment)} of the views at random"
     if settings.tolerance is None:
-        return f"{settings.steps} steps"
+        return f"L-BFGS, {settings.steps} steps"
     few = f"{PATIENCE} in a row change the loss by less than {values['stop_below']:.1e} of it"
-    return f"at most {settings.steps} steps, until {few}"
+    return f"L-BFGS, at most {settings.steps} steps, until {few}"
 
 
 def _temperatures(settings: JointSettings) -> str:

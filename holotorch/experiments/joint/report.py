@@ -1,5 +1,6 @@
 """The section of a report page for a joint run."""
 
+import math
 from typing import Any
 
 from holotorch.experiments.joint.names import NAMES, SETS
@@ -59,10 +60,16 @@ def _views(rows: list[dict[str, str]]) -> str:
     for row in rows:
         wavelength = float(row["wavelength_m"])
         y, x, radius = (float(row[f"pupil_{name}_per_m"]) * wavelength for name in ("y", "x", "radius"))
-        pupil = f"{y:.4f}, {x:.4f}; {radius:.4f}" + (f", {row['half']} half" if row["half"] else "")
+        pupil = f"{y:.4f}, {x:.4f}; {radius:.4f}{_covered(row)}"
         place = row["view"], row["use"], f"{1e3 * float(row['focus_m']):.3f} mm", pupil
         lines.append([*place, f"{1e9 * wavelength:.0f} nm", f"{row['psnr']} dB", row["ssim"], row["contrast"]])
     return table(columns, lines)
+
+
+def _covered(row: dict[str, str]) -> str:
+    """Where the covered half of a pupil lies, if it has one."""
+    y, x = float(row["covered_y"]), float(row["covered_x"])
+    return f", half covered towards {math.degrees(math.atan2(y, x)):.0f} deg" if y or x else ""
 
 
 def _methods(methods: dict[str, dict[str, Any]]) -> str:

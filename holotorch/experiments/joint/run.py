@@ -73,6 +73,12 @@ def _fingerprint(experiment: JointExperiment) -> Fingerprint:
     _, inputs, _ = fingerprint_inputs(experiment.scene)
     settings = experiment.settings
     free = {"device", "steps"}
+    if settings.eye.per_step is None:
+        free.add("eye.per_step")  # checkpoints of before there was one do not have it
+    else:
+        free.remove("steps")  # the learning rate falls over the steps
+    if settings.eye.parallax:
+        inputs["eye.parallax"] = (repr(experiment.trained.operator.views),)
     if settings.display.kernel is None:
         free.add("display.kernel")  # checkpoints of before there was one do not have it
     else:

@@ -5,7 +5,9 @@ import math
 import torch
 
 from holotorch.experiments.joint.budget import PATIENCE
+from holotorch.experiments.joint.config import FOCI_PER_STEP
 from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.joint.methods import CIRCLES
 from holotorch.experiments.joint.pictures import SWEEP
 from holotorch.experiments.planning.machine import Machine
 
@@ -22,12 +24,26 @@ _PANEL = 0.02  # per picture in a table of pictures
 _DOUBLE = 2.0  # time of double over that of single precision
 _FINER = 4  # factor on the time for images with twice as many samples along each axis
 _FIGURES = 3  # two tables of pictures, and the phases
-_STEPS_OF = {"random": 0.0, "afterwards": 0.0, "unheated": 1.0, "retrieved": 0.7, "retrieved_pec": 1.2, "slabs": 0.4}
+_STEPS_OF = {
+    "random": 0.0,
+    "afterwards": 0.0,
+    "unheated": 1.0,
+    "light_field": 0.6,
+    "retrieved": 0.7,
+    "retrieved_pec": 1.2,
+    "slabs": 0.4,
+}
 
 
 def view_samples(experiment: JointExperiment) -> tuple[int, int]:
     """Padded samples (y, x) of a view."""
     return experiment.padded(experiment.padding).shape
+
+
+def step_views(experiment: JointExperiment) -> int:
+    """Number of views in each step of the solver."""
+    foci, eye = len(experiment.foci), experiment.settings.eye
+    return foci + eye.parallax if eye.per_step is None else min(FOCI_PER_STEP, foci) + eye.per_step
 
 
 def _transform(experiment: JointExperiment, machine: Machine) -> float:
@@ -39,7 +55,7 @@ def _transform(experiment: JointExperiment, machine: Machine) -> float:
 def step_seconds(experiment: JointExperiment, machine: Machine) -> float:
     """One step of the solver."""
     settings = experiment.settings
-    views = settings.frames * len(settings.wavelengths) * (len(experiment.foci) + settings.eye.parallax)
+    views = settings.frames * len(settings.wavelengths) * step_views(experiment)
     double = _DOUBLE if experiment.dtype == torch.float64 else 1.0
     return _CALL * machine.interpreter + double * _STEP * views * _transform(experiment, machine)
 
@@ -55,15 +71,16 @@ def seconds_of(experiment: JointExperiment, machine: Machine) -> dict[str, float
     """Seconds of each part of the whole command; the factors of the other methods are relative to the solver."""
     settings, planes = experiment.settings, len(experiment.foci)
     colours, fields = len(settings.wavelengths), settings.frames * len(settings.wavelengths)
-    transform, pixels, scored = _transform(experiment, machine), math.prod(experiment.grid.shape), 4 * planes - 1
+    transform, pixels, scored = _transform(experiment, machine), math.prod(experiment.grid.shape), 6 * planes - 1
     sweep = SWEEP if planes > 1 else 1
     start = _SOURCES * fields * planes * pixels * math.log2(pixels) * machine.fft(pixels)
     start += _PLANNING * planes * machine.interpreter + _DECONVOLUTION * fields * pixels * machine.elementwise
     step = step_seconds(experiment, machine)
     steps = settings.steps * step
-    wanted = 5 * planes - 1 + settings.eye.parallax + sweep
+    wanted = 7 * planes - 1 + settings.eye.parallax + sweep
     scores = machine.score(colours * planes * pixels, double=False) * scored / planes
     evaluated = _SHOWN * fields * scored * transform + scores
+    wanted += CIRCLES if "light_field" in settings.report.baselines else 0
     others, shown = settings.report.baselines, 2 + len(settings.report.baselines)
     pictures = 2 * _SWEEP_PIXEL * pixels * max(1, 2 * sweep - 2) + _PANEL * shown * (planes + 4)
     return {

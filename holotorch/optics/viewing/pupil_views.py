@@ -1,5 +1,6 @@
 """PupilViews: fields of a hologram through distant pupils, each at its focal distance, without lenses."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -121,6 +122,14 @@ class PupilViews(PreciseModule):
             raise ValueError(f"field must end in (C, V, H, W) = {expected}, got {tuple(field.shape)}")
         spectrum = (fft2(field, self.padded.shape) * self.kernel_for(field).conj()).sum(-3)
         return ifft2(spectrum, self.grid.shape)
+
+    def select(self, indices: Sequence[int]) -> "PupilViews":
+        """Some of the views, by their indices; their transfer functions are not computed again."""
+        part, chosen = copy.copy(self), list(indices)
+        part.views = tuple(self.views[v] for v in chosen)
+        part.single_kernel = self.single_kernel[:, chosen]
+        part.double_kernel = None if self.double_kernel is None else self.double_kernel[:, chosen]
+        return part
 
     def extra_repr(self) -> str:
         """Grid, wavelengths and number of views, for ``print(module)``."""

@@ -44,7 +44,7 @@ def test_the_joint_correction_is_ahead_of_every_baseline_also_where_it_was_not_t
     made = experiment("frames=6", "steps=40", "wavelengths=[520 nm]")
     joint = scores(made, made.solve().x)
     assert joint["peak_phase_pi"] <= 4
-    for name in ("random", "afterwards", "retrieved", "retrieved_pec", "slabs"):
+    for name in ("random", "afterwards", "light_field", "retrieved", "retrieved_pec", "slabs"):
         other = evaluate(made, baseline(made, name))[0]
         for views in ("stack", "held"):
             assert joint[f"{views}_psnr"] > other[f"{views}_psnr"] + 10
@@ -182,6 +182,8 @@ def test_a_focus_at_the_array_is_taken_and_a_plane_behind_it_is_not():
         (["display.distance=0.1 mm", "display.depth=null"], "display.distance: expected the whole volume in front"),
         (["display.shape=[8, 8]"], "at least 11 x 11 px"),
         (["eye.pupil=1.1"], "eye.pupil"),
+        (["eye={parallax: 2, per_step: 3}"], "expected at most the 2 parts of eye.parallax, got 3"),
+        (["eye={parallax: 2, per_step: 1}", "tolerance=0.1"], "leave eye.per_step or it out"),
         (["display.sigma=1"], "display.sigma"),
         (["volume.path=/nowhere.nrrd"], "expected a file or folder that exists"),
     ],
@@ -207,10 +209,12 @@ def test_a_run_has_its_tables_and_pictures_and_can_be_exported(tmp_path, capsys)
     with open(folder / "views.csv", newline="") as stream:
         views = list(csv.DictReader(stream))
     trained = len({row["view"] for row in views if row["use"] == "trained"})
-    assert trained >= 2 and len(views) == 3 * (trained + 1 + 4)  # for each colour
+    assert trained >= 2 and len(views) == 3 * (trained + 1 + 4 + 4)  # for each colour
     arrays = [np.load(folder / "arrays" / f"{name}.npy") for name in ("target", "shown")]
     assert (
-        arrays[0].shape == arrays[1].shape == (trained + 1 + 4, 3, *np.load(folder / "arrays" / "phase.npy").shape[-2:])
+        arrays[0].shape
+        == arrays[1].shape
+        == (trained + 1 + 4 + 4, 3, *np.load(folder / "arrays" / "phase.npy").shape[-2:])
     )
     from PIL import Image
 
@@ -244,12 +248,12 @@ def test_anybody_can_compute_the_pictures_of_a_run_from_its_files(tmp_path):
     spread = sum(taps[i, j] * padded[:, i : i + height, j : j + width] for i in range(5) for j in range(5))
     scales = []
     for row in rows:
-        number = {name: float(value) for name, value in row.items() if name not in ("use", "half")}
+        number = {name: float(value) for name, value in row.items() if name != "use"}
         size = 512
         fy, fx = np.fft.fftfreq(size, number["pitch_y_m"])[:, None], np.fft.fftfreq(size, number["pitch_x_m"])
         y, x = fy - number["pupil_y_per_m"], fx - number["pupil_x_per_m"]
         pupil = (y**2 + x**2 <= number["pupil_radius_per_m"] ** 2) & (
-            {"": 0, "left": 1, "right": -1}[row["half"]] * x <= 0
+            number["covered_y"] * y + number["covered_x"] * x <= 0
         )
         axial = np.sqrt(number["wavelength_m"] ** -2 - fy**2 - fx**2)
         spectrum = np.fft.fft2(np.exp(1j * spread), (size, size))

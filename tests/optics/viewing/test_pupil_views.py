@@ -75,3 +75,15 @@ def test_a_focus_on_the_array_sees_the_array_itself():
     views = PupilViews(GRID, WAVELENGTH, [View(0.0)])
     assert views.padded == GRID
     torch.testing.assert_close(views(field)[:, 0], field)
+
+
+def test_selected_views_are_those_of_the_whole_and_leave_it_as_it_is():
+    views = PupilViews(GRID, WAVELENGTH, [View(focus, 0.5 * LIMIT) for focus in (1e-3, 2e-3, 3e-3)])
+    field = noise(1, 40, 36)
+    for each in (field, field.to(torch.complex64)):
+        torch.testing.assert_close(views.select([2, 0])(each), views(each)[:, [2, 0]], rtol=0, atol=0)
+    assert views.select([2]).views == views.views[2:] and len(views.views) == 3
+    back = views.select([1]).adjoint(views(field)[:, [1]])
+    torch.testing.assert_close(
+        back, PupilViews(GRID, WAVELENGTH, [views.views[1]], longest=3e-3).adjoint(views(field)[:, [1]])
+    )

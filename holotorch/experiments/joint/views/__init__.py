@@ -1,0 +1,1 @@
+"""Views of the joint correction: parts of the pupil, and steps that take some of the views."""
