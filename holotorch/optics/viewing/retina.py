@@ -81,8 +81,8 @@ def plan_retina(
     (tests/optics/viewing/test_line_errors.py). Without an example that holds for light that is speckled all over the
     hologram. Smooth light errs less, since little of it reaches the edge of the pupil: photographs of constant phase 2
     to 60 times and beams about 100 times or more; points lie anywhere between. Two exceptions: the error of a few
-    points by elements may be 4 times too large, and that of the collapse, if the eyepiece cuts light off, 6 times too
-    small.
+    points by either method may be 4 times too large, and that of the collapse, if the eyepiece cuts light off, 3 to 6
+    times too small (``holotorch chart retina``).
 
     Args:
         grid: Sampling of the hologram.
