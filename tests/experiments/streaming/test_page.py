@@ -294,8 +294,8 @@ def test_a_replay_shows_each_pose_over_its_recorded_frame(tmp_path, folder):
             recorder.write(Frame(i / 20, torch.full((3, 480, 640), i, dtype=torch.uint8)))
     server = replayed(tmp_path, given)
     server.port, seen, sent = 0, [], []
-    server.see = lambda pixels, pose, captured: seen.append((int(pixels[0, 0, 0]), pose.status.name, captured))
-    server.send = lambda pose, captured, **_: sent.append((pose.status.name, captured)) or 0
+    server.see = lambda pixels, pose, captured: seen.append((int(pixels[0, 0, 0]), pose.status, captured))
+    server.send = lambda pose, captured, **_: sent.append((pose.status, captured)) or 0
     assert stream([str(tmp_path / "poses.csv")], page=server, rate=200, show=lambda _: None).complete
     assert len(sent) == 4 and seen == [(i, *sent[i]) for i in range(3)]
     assert json.loads(server._setup())["empty"] == ""

@@ -134,9 +134,11 @@ def test_pictures_of_every_kind_are_looked_for_in_a_folder(tmp_path):
 def test_photographs_of_one_reason_and_those_that_fit_badly_are_told_in_a_line():
     one = torch.eye(3, dtype=torch.float64)
     coverage = Coverage(1.0, 1.0, (0.1, 0.7), 0.7)
-    deviations = dict.fromkeys(PARAMETERS, 0.1)
+    deviations: dict[str, float] = {name: 0.1 for name in PARAMETERS}
     views = {"a.png": 0.16, "b.png": 0.2, "c.png": 0.19}
-    found = Calibration(Camera(one), (300, 400), deviations, deviations, 0.18, views, {"d.png": 23.5}, coverage, ())
+    found = Calibration(
+        Camera(one, torch.zeros(5)), (300, 400), deviations, deviations, 0.18, views, {"d.png": 23.5}, coverage, ()
+    )
     text = calibration_text(found, {"e.png": "no board", "f.png": "dark", "g.png": "no board"}).splitlines()
     assert "Used       3 of 7 photographs" in text
     assert "Left out   d.png: 23.50 px, the others 0.19 px (median): another camera or board, or blurred?" in text
