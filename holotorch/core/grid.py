@@ -30,8 +30,8 @@ class Grid:
     pitch: tuple[float, float]
 
     def __init__(self, shape: tuple[int, int] | int, pitch: tuple[float, float] | float):
+        sizes = tuple(shape) if isinstance(shape, Sequence) else (shape, shape)
         # A text such as "8 um" is a single value, which its check refuses.
-        sizes = tuple(shape) if isinstance(shape, Sequence) and not isinstance(shape, str) else (shape, shape)
         steps = tuple(pitch) if isinstance(pitch, Sequence) and not isinstance(pitch, str) else (pitch, pitch)
         if len(sizes) != 2 or len(steps) != 2:
             raise ValueError(f"grid needs shape (H, W) and pitch (y, x), got shape {shape!r} and pitch {pitch!r}")

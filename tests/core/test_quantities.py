@@ -86,11 +86,11 @@ def test_tensors_are_checked_element_by_element_with_their_gradients():
 def test_what_is_no_tensor_is_told_how_to_become_one():
     for check in (checks.real, lambda name, value: checks.field(name, value, (2, 2))):
         with pytest.raises(TypeError, match=r"light must be a.* got ndarray; use torch.from_numpy\(\.\.\.\)$"):
-            check("light", np.zeros((2, 2)))
+            check("light", np.zeros((2, 2)))  # type: ignore[arg-type]
         with pytest.raises(TypeError, match=r"light must be a.* got list; use torch.tensor\(\.\.\.\)$"):
-            check("light", [[0.0, 0.0], [0.0, 0.0]])
+            check("light", [[0.0, 0.0], [0.0, 0.0]])  # type: ignore[arg-type]
         with pytest.raises(TypeError, match="light must be a.* got NoneType$"):
-            check("light", None)
+            check("light", None)  # type: ignore[arg-type]
 
 
 def test_a_real_field_is_told_how_to_become_complex():

@@ -45,4 +45,4 @@ def test_an_array_of_numpy_is_told_to_become_a_tensor():
     array = PhasedArray(WAVES, ThermalCrosstalk(0))
     for call in (array, array.temperature, array.phase):
         with pytest.raises(TypeError, match=r"phase or temperature must be .* got ndarray; use torch.from_numpy"):
-            call(np.zeros((3, 4, 5)))
+            call(np.zeros((3, 4, 5)))  # type: ignore[arg-type]

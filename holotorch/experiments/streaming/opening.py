@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.streaming.stream import Frame, address
+from holotorch.experiments.streaming.stream import Frame, address, recording_of
 from holotorch.experiments.tracking.devices import build_camera, build_catheter, load_camera, load_catheter
 from holotorch.io.bundled import find_config
 from holotorch.tracking import THESIS
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from holotorch.experiments.streaming.page import PageServer
 
 PLACE = "127.0.0.1:8765"
+# What a page says in place of the tracked frames of a replay.
+_UNSEEN = "no frames: the run has kept none; holotorch track with --record keeps them"
 
 
 def open_page(
@@ -56,6 +58,7 @@ def open_page(
         shown = OVERLAY if panel == OVERLAY else None if panel is None else PanelSource(panel)
     except ValueError as error:
         raise ConfigError([f"--panel: {error}; or pattern, or overlay"]) from None
+    replayed = source.lower().endswith(".csv")
     return PageServer(
         THESIS if tool is None else build_catheter(load_catheter(tool)),
         None if lens is None or headset is not None else build_camera(load_camera(lens)),
@@ -66,6 +69,7 @@ def open_page(
         aligner=None if align is None else Aligner(align),
         volume=None if volume is None else load_registered(volume),
         panel=shown,
+        empty=_UNSEEN if replayed and recording_of(folder) is None else "",
     )
 
 

@@ -61,6 +61,7 @@ class PageServer:
         aligner: Fits the place of the camera on a headset to the alignments that pages send; it names the frame then.
         volume: A volume whose slice at the tip the pages can show.
         panel: Video that the pages can show beside the catheter; "overlay" for the tracked frames with the pose drawn.
+        empty: Why there are no tracked frames to show, which pages say in their place.
 
     Attributes:
         malformed: Number of messages of pages that were dropped.
@@ -80,11 +81,12 @@ class PageServer:
         aligner: Aligner | None = None,
         volume: RegisteredVolume | None = None,
         panel: PanelSource | Literal["overlay"] | None = None,
+        empty: str = "",
     ):
         self.port, self.host, self.certificate = checks.port(port), host, certificate
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(16)
         self.malformed = 0
-        self.aligner, self._volume, self._panel = aligner, volume, panel
+        self.aligner, self._volume, self._panel, self._empty = aligner, volume, panel, empty
         self._catheter, self._camera, self._frame = catheter, camera, frame if aligner is None else aligner.name
         self._encoders: dict[Channel, Encoder] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -183,7 +185,7 @@ class PageServer:
     def _setup(self) -> str:
         message: dict[str, Any] = {"kind": "setup", "frame": self._frame, "catheter": _tool(self._catheter)}
         message["camera"] = _lens(self._camera) if self._frame == FRAME else None
-        message |= {"align": self.aligner is not None, "panel": self._panel is not None}
+        message |= {"align": self.aligner is not None, "panel": self._panel is not None, "empty": self._empty}
         message["volume"] = None if self._volume is None else self._volume.setup()
         return json.dumps(message, allow_nan=False)
 

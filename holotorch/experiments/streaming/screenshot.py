@@ -10,9 +10,9 @@ from torch import Tensor
 
 from holotorch.experiments.streaming.chromium import CHROMIUM, BrowserError, browser
 from holotorch.experiments.streaming.opening import open_page
-from holotorch.experiments.streaming.stream import read_poses
+from holotorch.experiments.streaming.stream import read_poses, recording_of
 from holotorch.io.files import write_bytes
-from holotorch.io.recording import is_recording, open_recording
+from holotorch.io.recording import open_recording
 from holotorch.tracking.pose.status import Pose
 from holotorch.tracking.streaming.packet import now
 
@@ -40,11 +40,11 @@ def screenshot(run: Path, out: Path) -> str:
 
 def _frame(run: Path, number: int) -> Tensor | None:
     """Pixels of a frame of the run's recording; None without one."""
-    for folder in (run / "recording", run / "synthetic"):
-        if is_recording(folder):
-            with open_recording(folder) as frames:
-                return next(itertools.islice(frames, number, None)).pixels
-    return None
+    folder = recording_of(run)
+    if folder is None:
+        return None
+    with open_recording(folder) as frames:
+        return next(itertools.islice(frames, number, None)).pixels
 
 
 async def _taken(run: Path, pose: Pose, frame: Tensor | None) -> bytes:

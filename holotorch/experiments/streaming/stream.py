@@ -16,6 +16,7 @@ import torch
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking.devices import build_headset, headset_covariance, load_headset
 from holotorch.experiments.tracking.report import COLUMNS
+from holotorch.io.recording import is_recording, open_recording
 from holotorch.tracking.pose.alignment import in_frame
 from holotorch.tracking.pose.smoothing import OneEuro
 from holotorch.tracking.pose.status import Pose, Status
@@ -121,6 +122,26 @@ def replay(poses: Sequence[TimedPose], rate: float | None = None) -> Iterator[Ti
         yield start + (captured - first if rate is None else i / rate), pose
 
 
+def recording_of(run: Path) -> Path | None:
+    """Folder of the frames that a run of ``holotorch track`` has recorded or rendered; None without one."""
+    return next((folder for folder in (run / "recording", run / "synthetic") if is_recording(folder)), None)
+
+
+def _with_frames(poses: Iterable[TimedPose], recording: Path, page: "PageServer") -> Iterator[TimedPose]:
+    """The poses of a replay; the page sees the recorded frame of each. ConfigError for a damaged recording."""
+    try:
+        frames = open_recording(recording)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from None
+    with frames:
+        pictures = iter(frames)
+        for captured, pose in poses:
+            frame = next(pictures, None)  # the recording of an interrupted run may be shorter than its table of poses
+            if frame is not None and frame.pixels is not None:
+                page.see(frame.pixels, pose, captured)
+            yield captured, pose
+
+
 def stream(
     sources: Sequence[str],
     to: Sequence[str] = (),
@@ -142,7 +163,8 @@ def stream(
         headset: File of a camera's position on a headset, see ``devices.HeadsetSettings``: poses are sent in its frame,
             with its covariance added. By default they are in the frame of the camera.
         igtl: Port of an OpenIGTLink server, to which Slicer connects; None for no server.
-        page: Server of a page that shows the poses in a browser; it opens and closes with the stream.
+        page: Server of a page that shows the poses in a browser; it opens and closes with the stream. Beside a
+            poses.csv, it shows the frames that the run has recorded.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
         repeat: Begin a poses.csv again at its end, until the user interrupts the stream.
         smooth: Smooth the poses by :class:`OneEuro`; the packets then state the lag of the filter.
@@ -165,7 +187,10 @@ def stream(
     if len(sources) == 1 and sources[0].lower().endswith(".csv"):
         recorded = read_poses(Path(sources[0]))
         repetitions = itertools.count() if repeat else range(1)
-        poses: Iterable[TimedPose] = itertools.chain.from_iterable(replay(recorded, rate) for _ in repetitions)
+        rounds: Iterator[Iterable[TimedPose]] = (replay(recorded, rate) for _ in repetitions)
+        if page is not None and (folder := recording_of(Path(sources[0]).parent)):
+            rounds = (_with_frames(once, folder, page) for once in rounds)
+        poses: Iterable[TimedPose] = itertools.chain.from_iterable(rounds)
     elif sources and track is not None:
         poses = track(sources)
     else:

@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 
 import torch
 from pydantic_core import PydanticCustomError
@@ -74,7 +75,8 @@ def calibrate_photographs(
     try:
         calibration = calibrate(views, usual)
     except ValueError as error:
-        raise ConfigError([str(error), *(f"{name}: {reason}" for name, reason in missing.items())]) from None
+        used = f"used {len(views)} of {len(paths)} photographs"
+        raise ConfigError([f"{used}: {error}", *_joined(missing)]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
     save_camera(out, calibration)
     return calibration, missing
@@ -111,23 +113,33 @@ def calibration_text(calibration: Calibration, missing: dict[str, str], board: S
     parts = [f"{name} {_rounded(x, calibration.deviations[name])}" for name, x in zip(PARAMETERS, values, strict=True)]
     coverage = calibration.coverage
     between = f", {math.degrees(coverage.between):.0f} deg between boards at most" if len(calibration.views) > 1 else ""
+    photographs = len(calibration.views) + len(calibration.left_out) + len(missing)
     low, high = (math.degrees(angle) for angle in coverage.tilts)
     lines = [
         f"Camera     {', '.join(parts[:4])} px, for frames of {calibration.size[1]} x {calibration.size[0]} px",
         f"Distortion {', '.join(parts[4:])}",
         f"Board      {describe_board(parse_board(board))}, rms {calibration.rms_px:.2f} px, "
         f"views: {len(calibration.views)}",
+        f"Used       {len(calibration.views)} of {photographs} photographs",
         f"Coverage   {100 * coverage.cells:.0f} % of the picture, {100 * coverage.radius:.0f} % of the way to its "
         f"corners, tilts of {low:.0f} to {high:.0f} deg{between}",
     ]
     lines += [f"View       {name}: {error:.2f} px" for name, error in calibration.views.items()]
-    lines += [
-        f"Left out   {name}: {error:.2f} px, more than 3 times the median and 0.5 px"
-        for name, error in calibration.left_out.items()
-    ]
-    lines += [f"Not used   {name}: {reason}" for name, reason in missing.items()]
+    others = (
+        f"px, the others {median(calibration.views.values()):.2f} px (median): another camera or board, or blurred?"
+    )
+    lines += [f"Left out   {name}: {error:.2f} {others}" for name, error in calibration.left_out.items()]
+    lines += [f"Not used   {line}" for line in _joined(missing)]
     lines += [f"Warning    {text}" for text in calibration.warnings]
     return "\n".join(lines)
+
+
+def _joined(reasons: dict[str, str]) -> list[str]:
+    """A line for each reason, with the names of all photographs to which it applies."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason, []).append(name)
+    return [f"{', '.join(each)}: {reason}" for reason, each in names.items()]
 
 
 def _rounded(value: float, deviation: float) -> str:

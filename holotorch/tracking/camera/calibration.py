@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
@@ -18,6 +19,7 @@ PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 SURE = 2e-3  # relative deviation of the focal length above which there is a warning: 1 mm for a tip at 0.5 m
 _CHECKED = 4  # least number of views for a jackknife and for leaving out bad views
 _ADVISED = 10  # number of views below which there is a warning
+_SCATTER = 1.0  # pixels: median error of the views above which something is wrong with board, pictures or views
 _CELLS = (6, 8)  # rows and columns of the grid of cells that the coverage counts
 
 
@@ -71,7 +73,8 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
     """Estimate focal lengths, principal point and five distortion coefficients from views of a board.
 
     Views with an rms error above 3 times the median and above 0.5 px are left out, the worst one first, as long as
-    three quarters of the views and at least 4 remain. Fewer than 4 views are supplemented by a prior for
+    three quarters of the views and at least 4 remain; the same if they spoil the fit to all others, as those of another
+    camera do. Fewer than 4 views are supplemented by a prior for
     ordinary cameras, which is not accurate enough for measurements; its uncertainty is part of the deviations.
 
     Args:
@@ -95,30 +98,26 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
         if low.min() < -0.5 or high[0] > width - 0.5 or high[1] > height - 0.5:
             raise ValueError(f"corners must lie within {width} x {height} px, but {view.name!r} has others")
     names = [view.name or f"view {i}" for i, view in enumerate(kept)]
-    left_out: dict[str, float] = {}
-    fit = estimate(kept, size) if len(kept) < _CHECKED else _fit(kept, size)
-    while len(kept) > _CHECKED and 4 * (len(kept) - 1) >= 3 * len(views):
-        worst = int(fit.errors.argmax())
-        if fit.errors[worst] <= max(3 * float(np.median(fit.errors)), 0.5):
-            break
-        left_out[names.pop(worst)] = float(fit.errors[worst])
-        kept.pop(worst)
-        fit = _fit(kept, size)
+    chosen, errors, fit = _selected(kept, size)
+    left_out = {names[i]: error for i, error in errors.items()}
+    kept, names = [kept[i] for i in chosen], [names[i] for i in chosen]
     coverage = _coverage(kept, fit, size)
     if len(kept) >= _CHECKED:
         if coverage.between < math.radians(10):
             raise ValueError(
-                f"all boards are parallel to within {math.degrees(coverage.between):.1f} degrees, which does not "
-                "determine the focal length; tilt the board by 20 to 45 degrees to several sides"
+                _no_single_camera(fit, names)
+                or f"all boards are parallel to within {math.degrees(coverage.between):.1f} degrees, which does "
+                "not determine the focal length; tilt the board by 20 to 45 degrees to several sides"
             )
         fit = fit._replace(deviations=np.maximum(fit.formal, _jackknife(kept, size, fit)))
     relative = float(max(fit.deviations[:2] / fit.values[:2]))
     if not relative <= 0.2:
         raise ValueError(
-            f"the views determine the focal length only to {100 * relative:.0f} % (one standard deviation); tilt the "
+            _no_single_camera(fit, names)
+            or f"the views determine the focal length only to {100 * relative:.0f} % (one standard deviation); tilt the "
             "board by 20 to 45 degrees to several sides and fill the picture with it"
         )
-    camera = Camera(torch.from_numpy(camera_matrix(fit.values)), torch.from_numpy(fit.values[4:].copy()), size=size)
+    camera = _camera(fit, size)
     weights = np.array([len(view.points) for view in kept])
     return Calibration(
         camera,
@@ -131,6 +130,65 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
         coverage,
         _warnings(camera, size, relative, coverage, fit.errors),
     )
+
+
+def _selected(views: Sequence[View], size: tuple[int, int]) -> tuple[list[int], dict[int, float], Estimate]:
+    """Indices of the views to use, rms errors in pixels of the others by index, and the fit to the former."""
+    kept, left_out = list(range(len(views))), dict[int, float]()
+    fit = estimate(views, size) if len(kept) < _CHECKED else _fit(views, size)
+    while _may_drop(len(kept), len(views)):
+        worst = int(fit.errors.argmax())
+        if fit.errors[worst] <= _limit(fit):
+            break
+        left_out[kept.pop(worst)] = float(fit.errors[worst])
+        fit = _fit([views[i] for i in kept], size)
+    if len(views) > _CHECKED and np.median(fit.errors) > _SCATTER:
+        with suppress(ValueError):  # what remains determines no camera
+            return _trimmed(views, size) or (kept, left_out, fit)
+    return kept, left_out, fit
+
+
+def _trimmed(views: Sequence[View], size: tuple[int, int]) -> tuple[list[int], dict[int, float], Estimate] | None:
+    """As :func:`_selected`, for views of which some spoil the fit to all others, such as those of another camera.
+
+    The quarter with the largest errors is dropped, one view at a time, and what fits the camera of the others comes
+    back. None if the others do not fit one camera either.
+    """
+    kept = list(range(len(views)))
+    fit = _fit(views, size)
+    while _may_drop(len(kept), len(views)):
+        kept.pop(int(fit.errors.argmax()))
+        fit = _fit([views[i] for i in kept], size)
+    if np.median(fit.errors) > _SCATTER:
+        return None
+    errors = dict(enumerate(reprojection(_camera(fit, size), views).tolist()))
+    kept = [i for i, error in errors.items() if i in kept or error <= _limit(fit)]
+    return kept, {i: error for i, error in errors.items() if i not in kept}, _fit([views[i] for i in kept], size)
+
+
+def _no_single_camera(fit: Estimate, names: Sequence[str]) -> str:
+    """What is wrong with views that scatter too much to be of one camera; empty if they do not."""
+    scatter, worst = float(np.median(fit.errors)), int(fit.errors.argmax())
+    if scatter <= _SCATTER:
+        return ""
+    return (
+        f"the views fit no single camera: half of them by {scatter:.1f} px or worse, {names[worst]} by "
+        f"{fit.errors[worst]:.1f} px; leave out those of another camera, zoom or board"
+    )
+
+
+def _may_drop(kept: int, count: int) -> bool:
+    """Whether one of the ``kept`` views may be left out, so that three quarters and those that check remain."""
+    return kept > _CHECKED and 4 * (kept - 1) >= 3 * count
+
+
+def _limit(fit: Estimate) -> float:
+    """Largest rms error in pixels of a view that agrees with the others."""
+    return max(3 * float(np.median(fit.errors)), 0.5)
+
+
+def _camera(fit: Estimate, size: tuple[int, int]) -> Camera:
+    return Camera(torch.from_numpy(camera_matrix(fit.values)), torch.from_numpy(fit.values[4:].copy()), size=size)
 
 
 def reprojection(camera: Camera, views: Sequence[View]) -> Tensor:
@@ -217,7 +275,7 @@ def _warnings(
         "a guess.": coverage.radius < 0.8,
         f"The boards differ by {math.degrees(coverage.between):.0f} degrees at most: tilt the board more, to several "
         "sides.": count > 1 and coverage.between < math.radians(25),
-        f"The corners scatter by {scatter:.1f} px: is the board flat, the picture sharp?": scatter > 1,
+        f"The corners scatter by {scatter:.1f} px: is the board flat, the picture sharp?": scatter > _SCATTER,
         "The fitted distortion cannot be inverted in the picture's corners: no poses there.": bool(
             camera.undistort(corners).isnan().any()
         ),

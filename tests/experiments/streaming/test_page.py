@@ -1,6 +1,7 @@
 """The server of the page: what it sends, whom it refuses, and what a bad page cannot do to it."""
 
 import asyncio
+import csv
 import json
 import math
 import re
@@ -21,6 +22,9 @@ from holotorch.experiments.streaming.opening import open_page
 from holotorch.experiments.streaming.page import PageServer
 from holotorch.experiments.streaming.stream import stream
 from holotorch.experiments.tracking.devices import save_camera
+from holotorch.experiments.tracking.report import COLUMNS, Tracked, row
+from holotorch.io.recording import Recorder
+from holotorch.io.video import Frame
 from holotorch.tracking import THESIS, Camera
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.packet import now
@@ -268,6 +272,40 @@ def test_the_command_replays_a_run_on_a_page_until_it_is_interrupted(tmp_path, m
     assert main(["stream", "--view", "--page", "127.0.0.1"]) == 2
     assert "it takes no --page" in capsys.readouterr().err
     assert main(["stream", "a.csv", "--to", "127.0.0.1"]) == 0 and given["page"] is None and not given["repeat"]
+
+
+def replayed(tmp_path: Path, poses: list[Pose]) -> PageServer:
+    """The page of a run of ``track`` with these poses."""
+    save_camera(tmp_path / "camera.yaml", CAMERA, CAMERA.size)
+    with open(tmp_path / "poses.csv", "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(COLUMNS)
+        for i, each in enumerate(poses):
+            frame = Frame(i / 20, torch.zeros(3, 1, 1, dtype=torch.uint8))
+            table.writerow(row(Tracked(i, frame, each, 0.0, {})))
+    return open_page(str(tmp_path / "poses.csv"))
+
+
+@pytest.mark.parametrize("folder", ["recording", "synthetic"])
+def test_a_replay_shows_each_pose_over_its_recorded_frame(tmp_path, folder):
+    given = [pose(0.01), REFUSED, pose(0.03), pose(0.04)]
+    with Recorder(tmp_path / folder, (480, 640), 20.0, "a camera") as recorder:
+        for i in range(3):  # cut off before the last pose
+            recorder.write(Frame(i / 20, torch.full((3, 480, 640), i, dtype=torch.uint8)))
+    server = replayed(tmp_path, given)
+    server.port, seen, sent = 0, [], []
+    server.see = lambda pixels, pose, captured: seen.append((int(pixels[0, 0, 0]), pose.status, captured))
+    server.send = lambda pose, captured, **_: sent.append((pose.status, captured)) or 0
+    assert stream([str(tmp_path / "poses.csv")], page=server, rate=200, show=lambda _: None).complete
+    assert len(sent) == 4 and seen == [(i, *sent[i]) for i in range(3)]
+    assert json.loads(server._setup())["empty"] == ""
+
+
+def test_a_replay_without_frames_says_why_none_are_shown(tmp_path):
+    server = replayed(tmp_path, [pose(0.01)])
+    server.port = 0
+    assert stream([str(tmp_path / "poses.csv")], page=server, show=lambda _: None).complete
+    assert "holotorch track with --record keeps them" in json.loads(server._setup())["empty"]
 
 
 def test_a_replay_of_another_kind_of_run_is_refused(tmp_path, capsys):

@@ -24,6 +24,7 @@ from holotorch.experiments.tracking.devices import (
 from holotorch.io.video import PICTURES
 from holotorch.tracking import THESIS, Camera
 from holotorch.tracking.camera.boards import Charuco, Chessboard
+from holotorch.tracking.camera.calibration import PARAMETERS, Calibration, Coverage
 from holotorch.tracking.pose.alignment import headset_from_camera, tool_points
 
 CONFIGS = paths.CONFIGS / "tracking"
@@ -124,7 +125,24 @@ def test_pictures_of_every_kind_are_looked_for_in_a_folder(tmp_path):
         cv2.imwrite(str(tmp_path / f"{i}{ending}"), 128 * torch.ones(60, 80, dtype=torch.uint8).numpy())
     with pytest.raises(ConfigError, match="photographs that show the board") as caught:
         calibrate_photographs([tmp_path], tmp_path / "camera.yaml")
-    assert all(f"{i}{ending}: no chessboard" in str(caught.value) for i, ending in enumerate(PICTURES))
+    used, reason = caught.value.mistakes
+    assert used.startswith(f"used 0 of {len(PICTURES)} photographs: a calibration needs photographs")
+    # One reason for all of them is said once.
+    assert sorted(reason.split(": no chessboard")[0].split(", ")) == [f"{i}{end}" for i, end in enumerate(PICTURES)]
+
+
+def test_photographs_of_one_reason_and_those_that_fit_badly_are_told_in_a_line():
+    one = torch.eye(3, dtype=torch.float64)
+    coverage = Coverage(1.0, 1.0, (0.1, 0.7), 0.7)
+    deviations: dict[str, float] = {name: 0.1 for name in PARAMETERS}
+    views = {"a.png": 0.16, "b.png": 0.2, "c.png": 0.19}
+    found = Calibration(
+        Camera(one, torch.zeros(5)), (300, 400), deviations, deviations, 0.18, views, {"d.png": 23.5}, coverage, ()
+    )
+    text = calibration_text(found, {"e.png": "no board", "f.png": "dark", "g.png": "no board"}).splitlines()
+    assert "Used       3 of 7 photographs" in text
+    assert "Left out   d.png: 23.50 px, the others 0.19 px (median): another camera or board, or blurred?" in text
+    assert text[-2:] == ["Not used   e.png, g.png: no board", "Not used   f.png: dark"]
 
 
 def test_boards_by_their_words():

@@ -118,6 +118,28 @@ def test_view_with_wrong_corners_is_left_out_and_named():
     assert found.left_out["slipped"] > 0.5 and found.rms_px < 0.2
 
 
+def bent(count, height=100.0):
+    """Views that no camera gives of a flat board, whose lines are parabolas of this height in pixels."""
+    for i, view in enumerate(exact(count, seed=9)):
+        pixels = view.pixels.numpy().copy()
+        pixels[:, 1] += height * (view.points[:, 0].numpy() / 0.1 - 1) ** 2
+        yield inside(view.points.numpy(), pixels, f"stranger {i}")
+
+
+def test_views_that_spoil_the_fit_to_all_others_are_left_out():
+    """A joint fit errs by 9 px in the median view and by less than three times that in the strangers."""
+    own = exact(8)
+    found, alone = calibrate([*bent(2), *own], SHAPE), calibrate(own, SHAPE)
+    assert set(found.left_out) == {"stranger 0", "stranger 1"} and min(found.left_out.values()) > 5
+    assert found.rms_px < 0.2 and len(found.views) == 8
+    np.testing.assert_allclose(values(found.camera), values(alone.camera), rtol=1e-6, atol=1e-6)
+
+
+def test_views_of_no_single_camera_are_refused_for_that_reason():
+    with pytest.raises(ValueError, match=r"fit no single camera: half of them by \d+.\d px or worse, .* by \d+.\d px"):
+        calibrate([*bent(5), *exact(6)], SHAPE)
+
+
 def test_coverage_and_warnings_of_few_views_in_the_middle():
     found = calibrate(exact(5, tilt=0.35, distance=2.5), SHAPE)
     text = " ".join(found.warnings)

@@ -78,7 +78,8 @@ function words() {
   const panel = pictures.pictures.panel && state.panel ? `\npanel: capture to frame ${ms(pictures.pictures.panel.latency)}` : "";
   byId("numbers").textContent =
     `tip ${tip} mm in ${state.setup ? state.setup.frame : "-"}\n` +
-    `capture to frame ${ms(state.latency)}, ${state.rate.toFixed(0)} frames/s, ${state.received} poses, ${state.lost} lost${panel}`;
+    `capture to frame ${ms(state.latency)}, ${state.rate.toFixed(0)} frames/s, ${state.received} poses, ${state.lost} lost${panel}` +
+    (camera() && state.setup.empty ? `\n${state.setup.empty}` : "");
   byId("alignment").textContent = aligning.alignmentText();
 }
 function frame() {
