@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
@@ -110,26 +111,27 @@ def test_the_pose_before_is_passed_on_but_not_across_a_refusal():
 def test_a_batch_has_the_poses_of_its_frames_one_by_one(batch):
     world = World((540, 960))
     tracker = CatheterTracker(world.camera, world.catheter, channels=ChannelOrder.RGB)
-    pixels = [case.frame() for case in world.still(0.3, 0.35, 3)]
-    pixels.insert(1, None)
-    pixels.insert(3, torch.zeros(3, 540, 960, dtype=torch.uint8))
-    alone = [None if each is None else tracker(each[None])[0] for each in pixels]
+    first, second, third = (case.frame() for case in world.still(0.3, 0.35, 3))
+    black = torch.zeros(3, 540, 960, dtype=torch.uint8)
+    frames = [Frame(0.0, first), Frame(0.1, None, "lost"), Frame(0.2, second), Frame(0.3, black), Frame(0.4, third)]
+    alone = [tracker((black if frame.pixels is None else frame.pixels)[None])[0] for frame in frames]
     calls = []
 
-    def counted(frames, previous):
-        calls.append((len(frames), previous))
-        return tracker(frames, previous)
+    class Counted:
+        times: ClassVar = {"edges": 1.0}
 
-    counted.times = {"edges": 1.0}
-    frames = [Frame(i / 30, each, "" if each is not None else "lost") for i, each in enumerate(pixels)]
-    found = list(follow(iter(frames), counted, batch))
+        def __call__(self, frames, previous):
+            calls.append((len(frames), previous))
+            return tracker(frames, previous)
+
+    found = list(follow(iter(frames), Counted(), batch))
     assert calls == {2: [(1, None), (2, None), (1, None)], 5: [(4, None)]}[batch]
     assert [(item.number, item.status) for item in found] == [
         *((0, Status.OK), (1, Status.BAD_FRAME), (2, Status.OK), (3, alone[3].status), (4, Status.OK))
     ]
     assert not alone[3].answered and found[1].pose.reason == "lost" and not found[1].stages
     for item, pose in zip(found, alone, strict=True):
-        if pose is not None:
+        if item.frame.pixels is not None:
             assert item.pose.reason == pose.reason
             for name in ("tip", "direction", "covariance", "chi_square"):
                 assert torch.equal(getattr(item.pose, name), getattr(pose, name)) or not pose.answered
