@@ -24,6 +24,8 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     track.add_argument("--no-video", action="store_true", help="write no videos")
     track.add_argument("--still", action="store_true", help="the catheter is at rest: measure its stability")
     track.add_argument("--rate", type=float, metavar="HZ", help="frames per second of a source without times")
+    about = "frames tracked at a time (default: 1); above 1, each is searched as a whole, without the pose before"
+    track.add_argument("--batch", type=int, default=1, metavar="N", help=about)
     track.set_defaults(action=_track)
 
     about = "a camera's intrinsics from photographs, its place on a headset, or the colours of a catheter's bands"
@@ -57,9 +59,10 @@ def _track(options: argparse.Namespace) -> int:
     from holotorch.experiments.tracking.config import TrackSettings
 
     given = {"source": options.source, "method": options.method, "record": options.record, "still": options.still}
-    given |= {"video": not options.no_video, "rate_hz": options.rate}
+    given |= {"video": not options.no_video, "rate_hz": options.rate, "batch": options.batch}
     given |= {name: str(path) for name in ("camera", "catheter", "headset") if (path := getattr(options, name))}
     arguments: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
+    arguments |= {("batch",): "argument --batch"}
     source, mistakes = Source(Path("track"), {"experiment": "track", **given}, arguments), list[str]()
     for word in options.overrides:
         override(source, word, mistakes)

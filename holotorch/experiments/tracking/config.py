@@ -24,6 +24,7 @@ class TrackSettings(Settings):
     camera's place on a headset; poses are also written in its frame. ``record``: save every frame without loss for a
     later run. ``video``: write a video with the pose drawn on every frame; of a synthetic recording also one without.
     ``still``: measure the tip's stability; the catheter must rest. ``rate_hz``: frames per second without time stamps.
+    ``batch``: frames that are tracked at a time; above 1, each is searched as a whole, without the pose before.
     """
 
     experiment: Literal["track"]
@@ -37,3 +38,4 @@ class TrackSettings(Settings):
     video: bool = True
     still: bool = False
     rate_hz: Annotated[Number, Field(gt=0)] | None = None
+    batch: Annotated[Count, Field(le=64)] = 1  # 64 frames of 1080 x 1920 px take 400 MB

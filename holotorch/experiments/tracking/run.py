@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -38,22 +39,32 @@ from holotorch.tracking.streaming.packet import now
 Entered = TypeVar("Entered")
 
 
-def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
-    """Track frame by frame.
+def follow(frames: Iterable[Frame], tracker: Tracker, batch: int = 1) -> Iterator[Tracked]:
+    """Track frame by frame, or ``batch`` > 1 frames at a time.
 
-    The tracker is called as ``tracker(frames [1, 3, H, W], previous)``, where ``previous`` holds the pose of the
-    previous frame, or is None if that frame was refused. A tracker may have a dict ``times``, the seconds of each stage
-    of its last call.
+    The tracker is called as ``tracker(frames [B, 3, H, W], previous)``. Frame by frame, ``previous`` holds the pose of
+    the previous frame, or is None if that frame was refused. In a batch it is None: each frame is searched by itself,
+    so that its pose does not depend on the size of the batch. A tracker may have a dict ``times``, the seconds of each
+    stage of its last call. The times of a frame are the mean over its batch.
     """
     previous: list[Pose] | None = None
-    for number, frame in enumerate(frames):
-        if frame.pixels is None:
-            previous = None
-            yield Tracked(number, frame, Pose.refused(Status.BAD_FRAME, frame.problem), 0.0, {})
-            continue
-        (pose,), seconds = timed(partial(tracker, frame.pixels[None], previous))
-        previous = [pose] if pose.answered else None
-        yield Tracked(number, frame, pose, seconds, dict(getattr(tracker, "times", {})))
+    numbered = enumerate(frames)
+    while group := list(islice(numbered, batch)):
+        pixels = [frame.pixels for _, frame in group if frame.pixels is not None]
+        found, seconds, times = iter(list[Pose]()), 0.0, dict[str, float]()
+        if pixels:
+            stacked = pixels[0][None] if len(pixels) == 1 else torch.stack(pixels)  # a single frame is not copied
+            poses, whole = timed(partial(tracker, stacked, previous))
+            found, seconds = iter(poses), whole / len(pixels)
+            times = {stage: time / len(pixels) for stage, time in getattr(tracker, "times", {}).items()}
+        for number, frame in group:
+            if frame.pixels is None:
+                pose = Pose.refused(Status.BAD_FRAME, frame.problem)
+                yield Tracked(number, frame, pose, 0.0, {})
+            else:
+                pose = next(found)
+                yield Tracked(number, frame, pose, seconds, dict(times))
+            previous = [pose] if batch == 1 and pose.answered else None
 
 
 def live(
@@ -248,7 +259,7 @@ def _track_all(
         recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, inputs.paths)
         source = _recorded(source, entered(recorder), run.signals)
     bar = entered(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
-    for item in follow(source, inputs.tracker):
+    for item in follow(source, inputs.tracker, settings.batch):
         with deferred(run.signals):
             _append(table, row(item))
             if in_headset and experiment.to_headset:

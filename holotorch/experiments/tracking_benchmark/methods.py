@@ -16,8 +16,9 @@ from holotorch.io.images import load_image
 from holotorch.tracking.detection.channels import ChannelOrder
 from holotorch.tracking.detection.stations import StationPlan
 from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.rolling_shutter import READOUT
 from holotorch.tracking.pose.status import Pose, Status
-from holotorch.tracking.refinement.photometric import PhotometricFit
+from holotorch.tracking.refinement.photometric import FitPlan, PhotometricFit
 from holotorch.tracking.simulation.world import Case, World
 
 BASE, COLD, PRIOR, FEWER = "thesis, OpenCV", "ours, cold", "ours, prior", "ours, fewer stations"
@@ -88,13 +89,18 @@ def photographs(folder: Path | None = None) -> tuple[Tensor, ...]:
     return tuple((255 * image).round().to(torch.uint8) for image in images if len(image) == 3)
 
 
-def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FEWER)) -> dict[str, Method]:
-    """Trackers by name, each a function of one frame [3, H, W] and its case; only PRIOR uses the truth of the case."""
+def methods(
+    world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FEWER), *, readout: float = READOUT
+) -> dict[str, Method]:
+    """Trackers by name, each a function of one frame [3, H, W] and its case; only PRIOR uses the truth of the case.
+
+    ``readout`` is that of :class:`CatheterTracker`: 0 if it is known that all rows are exposed at the same time.
+    """
     camera, catheter = world.camera, world.catheter
     thesis, literal = ThesisOpenCV(camera, catheter), ThesisOpenCV(camera, catheter, literal=True)
-    create = partial(CatheterTracker, camera, catheter, channels=ChannelOrder.RGB)
+    create = partial(CatheterTracker, camera, catheter, channels=ChannelOrder.RGB, readout=readout)
     ours, fewer = create(), create(stations=FEWER_STATIONS)
-    fitted = create(refinement=PhotometricFit(camera, catheter))
+    fitted = create(refinement=PhotometricFit(camera, catheter, plan=FitPlan(readout=readout)))
     expected = lru_cache(maxsize=16)(before)  # cached, so that its computation does not count as time of the tracker
     known: dict[str, Method] = {
         BASE: lambda frame, _: thesis(frame[None])[0],

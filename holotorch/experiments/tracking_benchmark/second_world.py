@@ -13,6 +13,7 @@ from tqdm import tqdm
 from holotorch.experiments.tracking_benchmark import bench, methods
 from holotorch.experiments.tracking_benchmark.bench import Row
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FIT, Answer
+from holotorch.tracking.pose.rolling_shutter import READOUT
 from holotorch.tracking.simulation.varied import CONDITIONS, NEGATIVES, TUNING_SEEDS, Trial, VariedWorld
 from holotorch.tracking.simulation.world import World
 
@@ -100,7 +101,9 @@ def _seen(world: VariedWorld, scene: Callable[[int], Trial], seed: int) -> list[
     """Answers of all methods to the scene of a seed."""
     trial = scene(seed)
     own = World(world.size, trial.camera, world.catheter)
-    trackers = methods.methods(own, (BASE, COLD, FIT))
+    # The kind of the camera's shutter is known, as its intrinsics are; the motion while the rows are read is not.
+    readout = READOUT if trial.rolling_shutter else 0.0
+    trackers = methods.methods(own, (BASE, COLD, FIT), readout=readout)
     return list(methods.answers([trial.case], trackers, None))
 
 

@@ -114,8 +114,8 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
     if not relative <= 0.2:
         raise ValueError(
             _no_single_camera(fit, names)
-            or f"the views determine the focal length only to {100 * relative:.0f} % (one standard deviation); tilt the "
-            "board by 20 to 45 degrees to several sides and fill the picture with it"
+            or f"the views determine the focal length only to {100 * relative:.0f} % (one standard deviation); tilt "
+            "the board by 20 to 45 degrees to several sides and fill the picture with it"
         )
     camera = _camera(fit, size)
     weights = np.array([len(view.points) for view in kept])

@@ -38,6 +38,7 @@ from holotorch.tracking.detection.stations import (
 )
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.resection import LinePose, on_host, pose_on_line
+from holotorch.tracking.pose.rolling_shutter import READOUT, readout_covariance
 from holotorch.tracking.pose.status import THREE_EDGES, Pose, Refusal, Status
 from holotorch.tracking.refinement.photometric import PhotometricFit
 
@@ -58,7 +59,8 @@ class ErrorFloors:
     defocus: float = 0.08  # per pixel of blur in all directions, which lets light from beside the tube leak in
     smear: float = 0.03  # per pixel of blur along the tube, from the lens or from motion
     coarse_edge: float = 0.07  # edges of frames whose chroma has fewer pixels than their luma (4:2:0 codecs)
-    line: float = 0.04  # offset of the line: light from one side moves the apparent middle of the tube
+    line: float = 0.02  # offset of the line: light from one side moves the apparent middle of the tube
+    stations: float = 2.5  # ratio of the line's deviations to those of its fit: background textures are correlated
     coarse_line: float = 0.17  # offset of the line in the same frames
 
 
@@ -120,6 +122,9 @@ class CatheterTracker(nn.Module):
         camera: Intrinsics and tone curve.
         catheter: Catheter to track; its colours must be saturated, with hues at least 25 degrees apart.
         most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN.
+        readout: Standard deviation in metres, along each axis, of the motion of the catheter while a rolling shutter
+            reads the rows of a frame. A frame does not show this motion, so that it is in each covariance. 0 for a
+            camera with a global shutter, or a catheter at rest. A ``refinement`` has its own, in its plan.
         channels: Order of the frames' channels. If it is None, frames are assumed to be RGB, and the constructor warns
             if another order would show the catheter in another valid pose (:func:`ambiguities`).
         stations: How many cross-sections of the tube determine its axis and its width.
@@ -135,9 +140,9 @@ class CatheterTracker(nn.Module):
             edges contradict the catheter, so that :func:`fit_band_edges` can correct it.
 
     Raises:
-        TypeError, ValueError: ``most_sd`` is not positive, or the colours are grey, too similar, or the same from both
-            ends. In a call: the frames are not [B, 3, H, W], uint8 or floating from 0 to 1; they require a gradient; or
-            their number differs from that of the previous poses.
+        TypeError, ValueError: ``most_sd`` is not positive, ``readout`` is negative, or the colours are grey, too
+            similar, or the same from both ends. In a call: the frames are not [B, 3, H, W], uint8 or floating from 0 to
+            1; they require a gradient; or their number differs from that of the previous poses.
 
     Source: Chapter 3 of the thesis defines the task (coloured bands, one camera). The method differs from the thesis.
     """
@@ -148,6 +153,7 @@ class CatheterTracker(nn.Module):
         catheter: Catheter,
         *,
         most_sd: float = MOST_SD,
+        readout: float = READOUT,
         channels: ChannelOrder | None = None,
         stations: StationPlan = STATION_PLAN,
         refinement: PhotometricFit | None = None,
@@ -155,6 +161,7 @@ class CatheterTracker(nn.Module):
         super().__init__()
         self.camera, self.catheter = camera, catheter
         self.most_sd = checks.quantity(TOOL_DEVIATION, most_sd, "most_sd")
+        self.readout = checks.nonnegative("readout", readout, "m")
         self.table = ColourTable(camera, catheter)
         self.channels = stated_order(channels, camera, catheter)
         self.lens, self.stations, self.refinement = Lens(camera), stations, refinement
@@ -413,7 +420,7 @@ class CatheterTracker(nn.Module):
             line_pose = self._solved(axis, edges)
             pixels = lens.distort(axis.line.plane(edges.t))
             self.edges_px[-1] = torch.from_numpy(np.stack([pixels.real, pixels.imag], -1))
-            pose = self._checked(line_pose, width, edges, cold=before is None)
+            pose = self._checked(line_pose, width, edges, sampler.height, cold=before is None)
             if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
                 text = f"the tube goes on beyond its end on one side only: {_EXCHANGED}"
                 raise Refusal(Status.INCONSISTENT, text, final=True)
@@ -479,10 +486,9 @@ class CatheterTracker(nn.Module):
         # Both deviations, expressed as displacements at the edges, are therefore raised to the larger one.
         middle = sum(t) / len(t)
         spread = math.sqrt(sum((each - middle) ** 2 for each in t) / len(t))
-        offset = math.hypot(
-            axis.offset_sd, axis.slope_sd * (middle - axis.centre), _FLOORS.line, _FLOORS.coarse_line * edges.coarse
-        )
-        most = max(offset, axis.slope_sd * spread)
+        shift, turn = _FLOORS.stations * axis.offset_sd, _FLOORS.stations * axis.slope_sd
+        offset = math.hypot(shift, turn * (middle - axis.centre), _FLOORS.line, _FLOORS.coarse_line * edges.coarse)
+        most = max(offset, turn * spread)
         positions = [self._positions[n] for n in known]
         line_pose = pose_on_line(
             axis.line, t, positions, along, most, most / max(spread, 1e-9), _FLOORS.shared, rough=rough
@@ -491,8 +497,18 @@ class CatheterTracker(nn.Module):
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return line_pose
 
-    def _checked(self, line_pose: LinePose, axis: Axis, edges: Edges, *, cold: bool) -> Pose:
-        """Pose after all checks; ``cold`` if there is no previous pose, so that ``axis`` has an independent width."""
+    def _read_out(self, line_pose: LinePose, height: int) -> np.ndarray:
+        """Covariance [6, 6] of tip and direction from a motion while a rolling shutter reads ``height`` rows."""
+        if not self.readout:
+            return np.zeros((6, 6))
+        tip, direction = (torch.from_numpy(value)[None] for value in (line_pose.tip, line_pose.direction))
+        return readout_covariance(self.camera, tip, direction, self.catheter.positions, height, self.readout)[0].numpy()
+
+    def _checked(self, line_pose: LinePose, axis: Axis, edges: Edges, height: int, *, cold: bool) -> Pose:
+        """Pose after all checks, in a frame of ``height`` rows.
+
+        ``cold``: there is no previous pose, so that ``axis`` has an independent width.
+        """
         visible = edges.t[np.isfinite(edges.t)]
         count = len(visible)
         freedom = count - 3  # degrees of freedom of positions along the line; the line is fitted separately
@@ -521,16 +537,17 @@ class CatheterTracker(nn.Module):
             depth = float((line_pose.tip + sum(self._positions) / len(self._positions) * line_pose.direction)[2])
             text = f"{ratio:.2f} times as wide as it should be at {depth:.2f} m"
             raise Refusal(Status.INCONSISTENT, text, final=True)
-        if line_pose.tip_sd > self.most_sd:
-            text = f"tip uncertain to {1e3 * line_pose.tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
+        moved_in_readout = self._read_out(line_pose, height)
+        tip_sd = math.sqrt(line_pose.tip_sd**2 + float(moved_in_readout.diagonal()[:3].sum()))
+        if tip_sd > self.most_sd:
+            text = f"tip uncertain to {1e3 * tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
             raise Refusal(Status.UNCERTAIN, text, final=True)
         # Edges that agree less well than their deviations say are that much less certain (the scale factor of Birge).
         scale = max(1.0, line_pose.chi_square / max(freedom, 1))
         status = Status.OK if freedom else Status.UNVERIFIED
         reason = "" if freedom else THREE_EDGES
-        tip, direction, covariance = map(
-            torch.from_numpy, (line_pose.tip, line_pose.direction, scale * line_pose.covariance)
-        )
+        covariance = scale * line_pose.covariance + moved_in_readout
+        tip, direction, covariance = map(torch.from_numpy, (line_pose.tip, line_pose.direction, covariance))
         chi_square, degrees = torch.from_numpy(np.array([line_pose.chi_square, freedom], dtype=np.float64))
         return Pose(tip, direction, covariance, chi_square, degrees, status, reason)
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.pose.rolling_shutter import READOUT, readout_covariance
 from holotorch.tracking.pose.status import THREE_EDGES, Pose, Status
 from holotorch.tracking.refinement.tube_light import SHARED, Frame, Items, TubeGeometry, TubeLight, Windows
 
@@ -46,7 +47,7 @@ class FitPlan:
     blur_floor: float = 0.03  # additional error of an edge per pixel of blur above ``blur``; 3 times that of the axis
     motion_floor: float = 0.01  # additional error of edge and axis per pixel of motion
     radius_spread: float = 0.02  # standard deviation of the logarithm of the radius: blur and shading at the sides
-    readout: float = 2e-4  # metres, standard deviation of a hand's motion while a rolling shutter reads; 0: global
+    readout: float = READOUT  # metres, deviation of the motion while a rolling shutter reads a frame; 0: global
     step: float = 2.0  # largest shift of an edge in one step
     reach: float = 6.0  # largest distance of an edge from its place in the rough pose, so that the window contains it
     unsure: float = 0.3  # deviation of an edge due to noise above which a window shows no edge; 0.5 without one
@@ -581,7 +582,8 @@ class PhotometricFit(nn.Module):
         lever = torch.cat([torch.stack(rows, -1), torch.stack(turns, -1)], 1)
         covariance = lever @ torch.linalg.inv_ex(state.normal)[0] @ lever.mT
         if self.plan.readout:
-            covariance = covariance + self._rolled(moved, height)
+            more = (self.positions, height, self.plan.readout)
+            covariance = covariance + readout_covariance(self.camera, tip, direction, *more)
         shift = unknown[:, -2 * len(self.positions) :: 2]
         deviation = (1 / state.information.clamp(min=1e-30) + state.floor[..., 0] ** 2).sqrt()
         converged = converged & (state.seen.sum(-1) >= 3)
@@ -589,19 +591,6 @@ class PhotometricFit(nn.Module):
         lost = torch.where(converged, 0.0, torch.nan)[:, None]
         pose = (tip + lost, direction + lost, covariance + lost[..., None])
         return PhotometricPose(*pose, rest[:, 5].exp(), state.misfit, shift, deviation, state.used)
-
-    def _rolled(self, frame: Frame, height: int) -> Tensor:
-        """Covariance [B, 6, 6] of tip and direction that a motion while a rolling shutter reads the frame adds.
-
-        Such a motion turns the tube's image, and stretches it, which looks like a shorter distance.
-        """
-        middle, half = self._middle(), self.positions[-1] - self._middle()
-        ends = frame.middle[:, None] + half * frame.axis[:, None] * frame.axis.new_tensor([[-1.0], [1.0]])
-        rows = self.camera.project(ends)[..., 1]
-        late = ((rows[:, 1] - rows[:, 0]) / (2 * half * height))[:, None, None]  # share of the readout per metre
-        across = torch.eye(3).to(frame.axis) - frame.axis[:, :, None] * frame.axis[:, None]
-        lever = torch.cat([-middle * across - frame.middle[:, :, None] * frame.axis[:, None], across], 1) * late
-        return self.plan.readout**2 * lever @ lever.mT
 
 
 _LIGHT = (2e-3, 0.98)  # light between which a tone curve is not clipped

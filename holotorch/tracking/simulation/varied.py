@@ -77,6 +77,11 @@ class Trial:
         return self.shot.camera
 
     @property
+    def rolling_shutter(self) -> bool:
+        """Whether the camera reads the rows of the frame one after another."""
+        return any(self.shot.rolling)
+
+    @property
     def tip(self) -> Tensor:
         """[3] float64, in metres, in the camera's coordinates."""
         return torch.from_numpy(np.asarray(self.shot.tip, np.float64))

@@ -145,10 +145,10 @@ def test_track_hands_its_arguments_on(monkeypatch):
 
     monkeypatch.setattr(execute, "execute", stand_in)
     words = ["--out", "o", "--method", "thesis", "--record", "--still", "--rate", "25"]
-    words += ["--headset", "h.yaml"]
+    words += ["--headset", "h.yaml", "--batch", "4"]
     assert main(["track", "0", "--camera", "c.yaml", "--catheter", "t.yaml", *words]) == 0
     assert taken[1:] == [Path("o"), "track"]
-    flags = {"method": "thesis", "record": True, "video": True, "still": True, "rate_hz": 25.0}
+    flags = {"method": "thesis", "record": True, "video": True, "still": True, "rate_hz": 25.0, "batch": 4}
     values = {
         "experiment": "track",
         "source": "0",
@@ -190,6 +190,8 @@ def test_track_with_wrong_arguments(capsys):
     words = said(capsys, "track", ".", *FILES, "--method", "best")
     assert words == "argument --method: method: expected 'ours' or 'thesis', got 'best'\n"
     assert "argument --rate: rate_hz: expected a finite number" in said(capsys, "track", ".", "--rate", "nan")
+    assert "argument --batch: batch: expected greater than or equal to 1" in said(capsys, "track", ".", "--batch", "0")
+    assert "argument --batch: batch: expected less than or equal to 64" in said(capsys, "track", ".", "--batch", "65")
     assert "SOURCE" in wrong(capsys, "track")
     assert "invalid float value: 'fast'" in wrong(capsys, "track", ".", "--rate", "fast")
     assert "unrecognized arguments: --colour" in wrong(capsys, "track", ".", "--colour", "red")

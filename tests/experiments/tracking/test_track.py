@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.io.video import Frame, Frames, open_frames
-from holotorch.tracking import THESIS, Camera, Catheter, Status
+from holotorch.tracking import THESIS, Camera, Catheter, CatheterTracker, ChannelOrder, Status
 from holotorch.tracking.simulation.world import World
 
 
@@ -104,6 +105,46 @@ def test_the_pose_before_is_passed_on_but_not_across_a_refusal():
     given = [None if previous is None else float(previous[0].tip[0]) for previous in tracker.previous]
     assert given == [None, 10 / 3e3, 20 / 3e3, None, None]
     assert found[4].pose.reason == "lost" and found[4].seconds == 0
+
+
+@pytest.mark.parametrize("batch", [2, 5])
+def test_a_batch_has_the_poses_of_its_frames_one_by_one(batch):
+    world = World((540, 960))
+    tracker = CatheterTracker(world.camera, world.catheter, channels=ChannelOrder.RGB)
+    first, second, third = (case.frame() for case in world.still(0.3, 0.35, 3))
+    black = torch.zeros(3, 540, 960, dtype=torch.uint8)
+    frames = [Frame(0.0, first), Frame(0.1, None, "lost"), Frame(0.2, second), Frame(0.3, black), Frame(0.4, third)]
+    alone = [tracker((black if frame.pixels is None else frame.pixels)[None])[0] for frame in frames]
+    calls = []
+
+    class Counted:
+        times: ClassVar = {"edges": 1.0}
+
+        def __call__(self, frames, previous):
+            calls.append((len(frames), previous))
+            return tracker(frames, previous)
+
+    found = list(follow(iter(frames), Counted(), batch))
+    assert calls == {2: [(1, None), (2, None), (1, None)], 5: [(4, None)]}[batch]
+    assert [(item.number, item.status) for item in found] == [
+        *((0, Status.OK), (1, Status.BAD_FRAME), (2, Status.OK), (3, alone[3].status), (4, Status.OK))
+    ]
+    assert not alone[3].answered and found[1].pose.reason == "lost" and not found[1].stages
+    for item, pose in zip(found, alone, strict=True):
+        if item.frame.pixels is not None:
+            assert item.pose.reason == pose.reason
+            for name in ("tip", "direction", "covariance", "chi_square"):
+                assert torch.equal(getattr(item.pose, name), getattr(pose, name)) or not pose.answered
+    assert found[4].stages == {"edges": {2: 1.0, 5: 0.25}[batch]}
+
+
+def test_a_run_tracks_in_batches(tmp_path, tracker):
+    """The stand-in takes one frame at a time, so that a larger batch fails and a batch with one good frame does not."""
+    source = pictures(tmp_path / "in", [30, None, 33])
+    folder, _ = tracked(tmp_path, source, batch=2, video=False)
+    assert [row["status"] for row in read(folder)] == ["OK", "BAD_FRAME", "OK"]
+    with pytest.raises(AssertionError):
+        tracked(tmp_path, source, "whole", batch=3, video=False)
 
 
 def test_a_recording_replays_to_the_same_poses(tmp_path, tracker, capsys):

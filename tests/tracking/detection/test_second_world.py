@@ -3,10 +3,13 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 from holotorch.tracking.detection.channels import ChannelOrder
 from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.evaluation.protocols import chi_square_quantile
 from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.rolling_shutter import READOUT
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.simulation.ray_camera import take
 from holotorch.tracking.simulation.varied import Trial, VariedWorld
@@ -62,3 +65,15 @@ def test_a_thinner_stick_is_refused(seed, radius):
     shot = replace(trial.shot, catheter=replace(THESIS, radius=radius))
     pose = CatheterTracker(trial.camera, THESIS, channels=ChannelOrder.RGB)(take(shot, seed)[None])[0]
     assert not pose.answered
+
+
+@pytest.mark.parametrize("seed", [40, 88])
+def test_the_ellipsoid_holds_the_tip_of_a_catheter_that_moves_while_a_rolling_shutter_reads(seed):
+    trial = WORLD.trial(seed, "rolling shutter")
+    frame = trial.frame()[None]
+    within = []
+    for readout in (READOUT, 0.0):
+        pose = CatheterTracker(trial.camera, THESIS, channels=ChannelOrder.RGB, readout=readout)(frame)[0]
+        error = pose.tip - trial.tip
+        within.append(float(error @ torch.linalg.solve(pose.covariance[:3, :3], error)) < chi_square_quantile(0.95))
+    assert within == [True, False]
