@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,7 +33,9 @@ class Grid:
     def __init__(self, shape: tuple[int, int] | int, pitch: tuple[float, float] | float):
         sizes = tuple(shape) if isinstance(shape, Sequence) else (shape, shape)
         # A text such as "8 um" is a single value, which its check refuses.
-        steps = tuple(pitch) if isinstance(pitch, Sequence) and not isinstance(pitch, str) else (pitch, pitch)
+        steps: tuple[Any, ...] = (pitch, pitch)
+        if isinstance(pitch, Sequence) and not isinstance(pitch, str):
+            steps = tuple(pitch)
         if len(sizes) != 2 or len(steps) != 2:
             raise ValueError(f"grid needs shape (H, W) and pitch (y, x), got shape {shape!r} and pitch {pitch!r}")
         object.__setattr__(self, "shape", tuple(checks.whole("grid shape", size, 1) for size in sizes))
