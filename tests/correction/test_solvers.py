@@ -274,4 +274,5 @@ def test_a_falling_learning_rate_settles_between_the_minima_of_an_objective_that
     settled = ProjectedAdam(0.2, final=0.01, **rest)(changed, start).x
     assert changed.steps == list(range(1, 201))
     restless = ProjectedAdam(0.2, **rest)(_Drawn(), start).x
-    assert (settled - 2).abs().max() < 0.02 < (restless - settled).abs().max()
+    # Steps around the middle are as long as the rate, which falls to a hundredth.
+    assert (settled - 2).abs().max() < 0.1 * (restless - 2).abs().max()

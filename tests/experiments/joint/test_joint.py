@@ -79,11 +79,15 @@ def test_a_measured_kernel_need_not_be_symmetric_and_is_named_by_the_plan(tmp_pa
         assert f"heat spreads by the measured kernel {tmp_path / 'kernel.csv'}, 3 x 3 px" in capsys.readouterr().out
 
 
+# Rows of a kernel that is wider than the array: 0.1 around a pixel of 1.
+WIDE = "\n".join(",".join("1" if i == j == 25 else "0.1" for j in range(51)) for i in range(51))
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
         ("1,2\n3", "display.kernel: {path}: expected a table of temperature rises"),
-        ("\n".join([",".join(["0.1"] * 51)] * 51), "display.kernel: 51 x 51 taps are more than the (48, 44) px of"),
+        (WIDE, "display.kernel: 51 x 51 taps are more than the (48, 44) px of"),
     ],
 )
 def test_a_kernel_that_cannot_be_used_is_said(rows, message, tmp_path, capsys):
