@@ -286,10 +286,7 @@ class JointExperiment:
         def own(colours: Sequence[int]) -> PupilViews:
             if len(colours) == len(whole.wavelengths):
                 return whole
-            wavelengths = [whole.wavelengths[colour] for colour in colours]
-            part = PupilViews(whole.grid, wavelengths, whole.views, longest=self.padding * max(self.foci))
-            assert part.padded == whole.padded  # the pupils, not the wavelengths, bound the directions of the light
-            return part.to(self.device)
+            return whole.select(range(len(whole.views)), colours)
 
         return SharedIntensity(own, len(whole.wavelengths), self.settings.frames)
 

@@ -123,12 +123,14 @@ class PupilViews(PreciseModule):
         spectrum = (fft2(field, self.padded.shape) * self.kernel_for(field).conj()).sum(-3)
         return ifft2(spectrum, self.grid.shape)
 
-    def select(self, indices: Sequence[int]) -> "PupilViews":
-        """Some of the views, by their indices; their transfer functions are not computed again."""
+    def select(self, indices: Sequence[int], channels: Sequence[int] | None = None) -> "PupilViews":
+        """Some of the views, by their indices, in all or some channels; transfer functions are not computed again."""
         part, chosen = copy.copy(self), list(indices)
+        rows = list(range(len(self.wavelengths)) if channels is None else channels)
         part.views = tuple(self.views[v] for v in chosen)
-        part.single_kernel = self.single_kernel[:, chosen]
-        part.double_kernel = None if self.double_kernel is None else self.double_kernel[:, chosen]
+        part.wavelengths = tuple(self.wavelengths[c] for c in rows)
+        part.single_kernel = self.single_kernel[rows][:, chosen]
+        part.double_kernel = None if self.double_kernel is None else self.double_kernel[rows][:, chosen]
         return part
 
     def extra_repr(self) -> str:

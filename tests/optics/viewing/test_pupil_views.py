@@ -77,6 +77,16 @@ def test_a_focus_on_the_array_sees_the_array_itself():
     torch.testing.assert_close(views(field)[:, 0], field)
 
 
+def test_selected_channels_are_those_of_the_whole_and_leave_it_as_it_is():
+    lengths = (640e-9, 520e-9, 450e-9)
+    views = PupilViews(GRID, lengths, [View(focus, 0.4 * LIMIT) for focus in (1e-3, 2e-3, 3e-3)])
+    field = noise(3, 40, 36)
+    for each in (field, field.to(torch.complex64)):
+        part = views.select([2, 0], [1, 2])
+        torch.testing.assert_close(part(each[1:]), views(each)[1:, [2, 0]], rtol=0, atol=0)
+    assert part.wavelengths == lengths[1:] and views.wavelengths == lengths and views(field).shape[:2] == (3, 3)
+
+
 def test_selected_views_are_those_of_the_whole_and_leave_it_as_it_is():
     views = PupilViews(GRID, WAVELENGTH, [View(focus, 0.5 * LIMIT) for focus in (1e-3, 2e-3, 3e-3)])
     field = noise(1, 40, 36)
