@@ -27,7 +27,7 @@ nitpick_ignore_regex = [
     ("py:.*", r"holotorch\.[\w.]*\._\w+"),  # private bases
     (
         "py:class",
-        r"holotorch\..*\.(Nodes|Axis|EndCheck|Sampler|Line|Place)|holotorch\.tracking\.camera\.numpy_lens\.Lens",
+        r"holotorch\..*\.(Nodes|Axis|EndCheck|Sampler|Line|Argument)|holotorch\.tracking\.camera\.numpy_lens\.Lens",
     ),
 ]
 autodoc_member_order = "bysource"
