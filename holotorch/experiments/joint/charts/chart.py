@@ -36,14 +36,13 @@ DEFAULT_STEPS = 60  # of a configuration that does not state another number
 # What each case changes in the configuration, and the methods besides the joint correction.
 ALWAYS = "random", "afterwards", "unheated", "light_field"
 RETRIEVED = "retrieved", "retrieved_pec"  # from the whole pupil; neither knows a limit on the phase
-# By the number of frames; more parts in a step help the parts and cost the stack.
-PARALLAX = {8: "eye={parallax: 200, per_step: 8}", 24: "eye={parallax: 200, per_step: 6}"}
+PARALLAX = "eye={parallax: 200, per_step: 6}"
 CASES: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "8 frames": ([], (*ALWAYS, *RETRIEVED, "slabs")),
     "24 frames": (["frames=24"], ALWAYS),
-    "8 frames, parallax": ([PARALLAX[8]], ALWAYS),
-    "8 frames, parallax, occlusion per pupil": ([PARALLAX[8], "eye.occlusion=pupil"], ALWAYS),
-    "24 frames, parallax": (["frames=24", PARALLAX[24]], ALWAYS),
+    "8 frames, parallax": ([PARALLAX], ALWAYS),
+    "8 frames, parallax, occlusion per pupil": ([PARALLAX, "eye.occlusion=pupil"], ALWAYS),
+    "24 frames, parallax": (["frames=24", PARALLAX], ALWAYS),
     "8 frames, sigma 1.0": (["display.sigma_px=1.0"], (*ALWAYS, *RETRIEVED)),
     "8 frames, limit 2 pi": (["display.max_phase=6.2832"], ALWAYS),
 }
@@ -110,7 +109,7 @@ def _experiment(scene: str, seed: int, changes: list[str], amount: Amount) -> Jo
     """The bundled configuration for one wavelength, without files where a folder of volumes is not given."""
     path = find_config(f"configs/joint/{scene}.yaml")
     assert path is not None
-    steps = amount.steps * (STEPS_OF_ADAM if any("per_step" in change for change in changes) else 1)
+    steps = amount.steps * (STEPS_OF_ADAM if PARALLAX in changes else 1)
     words = ["wavelengths=[520 nm]", f"seed={seed}", f"steps={steps}"]
     words += [f"display.shape=[{amount.size},{amount.size}]", "eye={}", *changes]
     settings = load_config(path, words + volume_file(scene))
