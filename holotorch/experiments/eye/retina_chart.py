@@ -142,8 +142,8 @@ def _lights(setting: Setting) -> dict[str, Tensor]:
     """Fields, complex128 [C, H, W], on the plane of the hologram, by name."""
     grid, wavelengths, shape = setting.grid, setting.wavelengths, (len(setting.wavelengths), *setting.grid.shape)
     generator = torch.Generator().manual_seed(SEED)
-    turns = torch.rand(2, *shape, generator=generator, dtype=torch.float64)
-    phases = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+    cycles = torch.rand(2, *shape, generator=generator, dtype=torch.float64)
+    phases = torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)
     amplitude = fit_image(load_image("coffee").double(), grid.shape).sqrt()
     amplitude = amplitude if shape[0] == 3 else amplitude[1:2]
     points = torch.zeros(shape, dtype=torch.complex128)

@@ -51,18 +51,18 @@ def follow(frames: Iterable[Frame], tracker: Tracker, batch: int = 1) -> Iterato
     numbered = enumerate(frames)
     while group := list(islice(numbered, batch)):
         pixels = [frame.pixels for _, frame in group if frame.pixels is not None]
-        found, seconds, times = iter(list[Pose]()), 0.0, dict[str, float]()
+        poses_left, seconds, times = iter(list[Pose]()), 0.0, dict[str, float]()
         if pixels:
             stacked = pixels[0][None] if len(pixels) == 1 else torch.stack(pixels)  # a single frame is not copied
             poses, whole = timed(partial(tracker, stacked, previous))
-            found, seconds = iter(poses), whole / len(pixels)
+            poses_left, seconds = iter(poses), whole / len(pixels)
             times = {stage: time / len(pixels) for stage, time in getattr(tracker, "times", {}).items()}
         for number, frame in group:
             if frame.pixels is None:
                 pose = Pose.refused(Status.BAD_FRAME, frame.problem)
                 yield Tracked(number, frame, pose, 0.0, {})
             else:
-                pose = next(found)
+                pose = next(poses_left)
                 yield Tracked(number, frame, pose, seconds, dict(times))
             previous = [pose] if batch == 1 and pose.answered else None
 
