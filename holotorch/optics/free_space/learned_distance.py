@@ -177,4 +177,4 @@ def _times_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
     if spectrum.shape[max(0, spectrum.ndim - 2 - len(leading)) : -2] != leading:  # torch.broadcast_shapes takes 8 us
         shape = torch.broadcast_shapes(spectrum.shape[:-2], leading)
         spectrum = spectrum.expand(*shape, *spectrum.shape[-2:])
-    return multiply_even(spectrum.clone(memory_format=torch.contiguous_format), quadrant)
+    return multiply_even(spectrum, quadrant, spectrum.new_empty(spectrum.shape))
