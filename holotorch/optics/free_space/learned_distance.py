@@ -84,7 +84,7 @@ class _TimesLearned(torch.autograd.Function):
         ones = [1] * (distance.ndim - wavelength.ndim)
         kernel, slope = quadrants.reshape(2, *ones, *wavelength.shape, *quadrants.shape[-2:])
         product = _times_even(spectrum, kernel)
-        ctx.save_for_backward(spectrum, kernel.conj_physical_(), _times_even(spectrum, slope), distance, wavelength)
+        ctx.save_for_backward(spectrum, kernel.conj_physical_(), slope, distance, wavelength)
         ctx.differentiable = differentiable
         return product
 
@@ -98,7 +98,7 @@ class _TimesLearned(torch.autograd.Function):
             slopes = iter(torch.autograd.grad(product, inputs, grad, create_graph=True))
             return *[next(slopes) if needed else None for needed in ctx.needs_input_grad[:2]], *[None] * 5
         to_spectrum = _times_even(grad, conjugate).sum_to_size(spectrum.shape) if ctx.needs_input_grad[0] else None
-        total = torch.vdot(grad.reshape(-1), slope.reshape(-1)).real
+        total = _dot_even(grad, spectrum, slope)
         return to_spectrum, total.to(distance.dtype).reshape(distance.shape), *[None] * 5
 
 
@@ -178,3 +178,20 @@ def _times_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
         shape = torch.broadcast_shapes(spectrum.shape[:-2], leading)
         spectrum = spectrum.expand(*shape, *spectrum.shape[-2:])
     return multiply_even(spectrum, quadrant, spectrum.new_empty(spectrum.shape))
+
+
+def _dot_even(grad: Tensor, spectrum: Tensor, quadrant: Tensor) -> Tensor:
+    """Real part of the scalar product of ``grad`` and :func:`_times_even`, for which no array of their size is made."""
+    height, width = grad.shape[-2:]
+    upper, lower = slice(0, height // 2 + 1), slice(height // 2 + 1, height)
+    left, right = slice(0, width // 2 + 1), slice(width // 2 + 1, width)
+
+    def product(rows: slice, columns: slice) -> Tensor:
+        return grad[..., rows, columns].conj() * spectrum[..., rows, columns]
+
+    folded = product(upper, left)
+    mirrored = folded[..., 1 : (width + 1) // 2]
+    mirrored += product(upper, right).flip(-1)
+    folded[..., 1 : (height + 1) // 2, :] += product(lower, left).flip(-2)
+    mirrored[..., 1 : (height + 1) // 2, :] += product(lower, right).flip((-2, -1))
+    return torch.vdot(folded.sum_to_size(quadrant.shape).conj().reshape(-1), quadrant.reshape(-1)).real
