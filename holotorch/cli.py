@@ -86,8 +86,9 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _finish(folder: Path, complete: bool) -> int:
-    report = folder / "report.html"
-    print(report if report.is_file() else folder)
+    from holotorch.experiments.execute import print_outcome
+
+    print_outcome(folder)
     return OK if complete else INTERRUPTED
 
 

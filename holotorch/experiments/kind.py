@@ -55,6 +55,10 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     def run(self, experiment: Experiment, folder: RunFolder) -> bool:
         """Compute the results and write all files of the folder; returns whether the run is complete."""
 
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        """The main numbers of a run in one or two lines, from the content of summary.json or interrupted.json."""
+        return []
+
     def restart(self, folder: Path, config: Mapping[str, Any]) -> str | None:
         """What to do instead if the interrupted run in ``folder`` cannot be continued, otherwise None."""
         return None

@@ -24,7 +24,7 @@ def test_a_new_kind_is_checked_run_and_reported(config, tmp_path, capsys):
     assert capsys.readouterr().out == "Steps      5\n"
     folder = tmp_path / "a"
     assert main(["run", config, "--out", str(folder)]) == 0
-    assert capsys.readouterr().out == f"Steps      4\n{folder / 'report.html'}\n"
+    assert capsys.readouterr().out == f"Steps      4\nResult     total 10\n{folder / 'report.html'}\n"
     assert {path.name for path in folder.iterdir()} == {
         *("config.yaml", "env.json", "images", "plan.json", "report.html", "summary.json")
     }
@@ -44,10 +44,15 @@ def test_a_new_kind_goes_on_where_it_was_interrupted(config, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(ToyKind, "step", pressed)
         assert main(["run", config, "--out", str(folder)]) == 130
+    assert capsys.readouterr().out == f"Steps      4\nResult     total 3\n{folder / 'report.html'}\n"
     assert json.loads((folder / "interrupted.json").read_text())["total"] == 3
     assert main(["run", config, "steps=6", "--out", str(folder)]) == 2
     assert "steps was 4 and is 6" in capsys.readouterr().err
     assert main(["resume", str(folder)]) == 0
+    assert capsys.readouterr().out == f"Steps      4\nResult     total 10\n{folder / 'report.html'}\n"
+    assert main(["resume", str(folder)]) == 0
+    complete = "this run is complete; nothing is left to do"
+    assert capsys.readouterr().out == f"{complete}\nResult     total 10\n{folder / 'report.html'}\n"
     assert json.loads((folder / "summary.json").read_text())["total"] == 10
 
 

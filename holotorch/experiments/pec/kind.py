@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.kind import ExperimentKind
@@ -45,6 +45,11 @@ class PECKind(ExperimentKind[PECSettings, "PECExperiment"]):
 
     def device(self, experiment: PECExperiment) -> str:
         return str(experiment.device)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.pec.report import pec_outcome
+
+        return pec_outcome(summary)
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.pec.report import pec_section
