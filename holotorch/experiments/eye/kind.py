@@ -20,6 +20,7 @@ class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
     settings = ObserverSettings
     example = "configs/eye/teapot.yaml"
     parallel = True
+    data = "volume.path"
 
     def build(self, settings: ObserverSettings) -> Observer:
         from holotorch.experiments.eye.experiment import observer

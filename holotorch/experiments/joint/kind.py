@@ -21,6 +21,7 @@ class JointKind(ExperimentKind[JointSettings, "JointExperiment"]):
     settings = JointSettings
     example = "configs/joint/teapot.yaml"
     parallel = True
+    data = "volume.path"
 
     def contradictions(self, settings: JointSettings) -> list[tuple[Key, str]]:
         return contradictions(settings)

@@ -22,6 +22,7 @@ class PECKind(ExperimentKind[PECSettings, "PECExperiment"]):
     settings = PECSettings
     example = "configs/pec/fourier.yaml"
     parallel = True
+    data = "target.image"
 
     def contradictions(self, settings: PECSettings) -> list[tuple[Key, str]]:
         return list(contradictions(settings))

@@ -21,6 +21,7 @@ class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
     settings = VolumeSettings
     example = "configs/volume/tooth.yaml"
     parallel = True
+    data = "volume.path"
 
     def contradictions(self, settings: VolumeSettings) -> list[tuple[Key, str]]:
         return contradictions(settings)
