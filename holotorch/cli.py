@@ -64,12 +64,13 @@ def _interruption_message(options: argparse.Namespace) -> str:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from holotorch.experiments.registry import load_config
+    from holotorch.experiments.registry import load_config, run_name
 
     settings = load_config(options.config, options.overrides)  # reports mistakes before torch is loaded
     from holotorch.experiments.execute import execute
 
-    return _finish(*execute(settings, options.out, Path(options.config).stem))
+    name = run_name(options.config, options.overrides, settings.experiment)
+    return _finish(*execute(settings, options.out, name))
 
 
 def _resume(options: argparse.Namespace) -> int:
@@ -86,8 +87,9 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _finish(folder: Path, complete: bool) -> int:
-    report = folder / "report.html"
-    print(report if report.is_file() else folder)
+    from holotorch.experiments.execute import print_outcome
+
+    print_outcome(folder)
     return OK if complete else INTERRUPTED
 
 
@@ -223,7 +225,8 @@ def _parser() -> argparse.ArgumentParser:
 
     about = "one experiment: pictures, numbers and a report in a folder of its own"
     run = command("run", _run, about, parents=[config])
-    run.add_argument("--out", type=Path, help="folder of the run (default: runs/CONFIG-001, ...)")
+    about = "folder of the run (default: runs/CONFIG-001, ..., or runs/FILE-001, ... of your own volume or picture)"
+    run.add_argument("--out", type=Path, help=about)
 
     add_sweep(commands)
     resume = command("resume", _resume, "go on with an interrupted run, as if it had never stopped")

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from holotorch.experiments.execute import execute
+from holotorch.experiments.execute import execute, print_outcome
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.report import write_report
 from holotorch.experiments.runs.folder import claim
@@ -27,11 +27,13 @@ def demo(out: Path | None, screenshot: Callable[[Path, Path], str]) -> tuple[Pat
     for settings, name in ((correction, "correction"), (volume, "volume")):
         if complete:
             part, complete = execute(settings, folder / name, name)
+            print_outcome(part)
             parts.append(part)
     more = {}
     if complete:
         _, complete = execute(tracking, folder / "tracking", "tracking")
-        execute(layout, folder / "layout", "layout")
+        print_outcome(folder / "tracking")
+        print_outcome(execute(layout, folder / "layout", "layout")[0])
         if reason := screenshot(folder / "tracking", folder / "tracking" / "view.png"):
             print(f"no picture of the view in a browser: {reason}")
         else:

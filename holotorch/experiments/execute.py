@@ -1,21 +1,26 @@
 """Implementation of the commands ``check``, ``run`` and ``resume`` for an experiment of any kind."""
 
+import os
 from pathlib import Path
 from typing import Any
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.source import read_source
 from holotorch.experiments.registry import KINDS, find_kind, load_config
-from holotorch.experiments.report import write_report
+from holotorch.experiments.report import outcome_lines, write_report
 from holotorch.experiments.runs.folder import RunFolder, open_run, tidied
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.processes import joined_processes
 from holotorch.experiments.runs.signals import interruptible
 from holotorch.io.files import write_bytes, write_json
 
+NO_FOLDER = Path(os.devnull)  # what ``execute`` returns as the folder in all processes of a run but the first
+
 
 def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, bool]:
     """Carry out a run with settings of any kind; returns its folder, and whether the run is complete.
+
+    Of several processes that share the run, all but the first return ``NO_FOLDER``.
 
     The folder is ``out``, or the next free ``runs/NAME-001``. If ``out`` holds an unfinished run of the same settings,
     that run is continued. The folder of an interrupted run holds the results so far.
@@ -30,7 +35,7 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
     with joined_processes(kind.parallel) as rank:
         if rank > 0:  # only the first process writes to the folder
             with interruptible() as signals:
-                return Path(), kind.run(experiment, RunFolder(Path(), name, plan, signals))
+                return NO_FOLDER, kind.run(experiment, RunFolder(Path(), name, plan, signals))
         if kind.announces:
             print(plan.text, flush=True)
         if plan.shortage:
@@ -46,6 +51,19 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
             if plan.values:
                 write_json(folder.path / "plan.json", plan.values)
             return folder.path, kind.run(experiment, folder)
+
+
+def print_outcome(folder: Path) -> None:
+    """Print the main numbers of a run, and where its pictures and its report are; nothing for ``NO_FOLDER``.
+
+    ConfigError if the summary in the folder cannot be read.
+    """
+    if folder == NO_FOLDER:
+        return
+    for line in outcome_lines(folder):
+        print(line)
+    report = folder / "report.html"
+    print(report if report.is_file() else folder)
 
 
 def check(settings: Any) -> RunPlan:

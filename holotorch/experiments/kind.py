@@ -30,6 +30,7 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     settings: type[SettingsT]  # pydantic model of the configuration
     parallel: ClassVar[bool] = False  # whether several processes, started by ``torchrun``, share one run
     announces: ClassVar[bool] = True  # whether the plan is printed before the run begins
+    data: ClassVar[str] = ""  # key of the user's own picture or volume, such as "target.image"; empty if there is none
     example: ClassVar[str]  # path of the bundled configuration that ``holotorch new`` copies
 
     def contradictions(self, settings: SettingsT) -> list[tuple[Key, str]]:
@@ -54,6 +55,10 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     @abstractmethod
     def run(self, experiment: Experiment, folder: RunFolder) -> bool:
         """Compute the results and write all files of the folder; returns whether the run is complete."""
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        """The main numbers of a run in one or two lines, from the content of summary.json or interrupted.json."""
+        return []
 
     def restart(self, folder: Path, config: Mapping[str, Any]) -> str | None:
         """What to do instead if the interrupted run in ``folder`` cannot be continued, otherwise None."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import nearest, validated
-from holotorch.experiments.config.source import read_source
+from holotorch.experiments.config.source import Source, override, read_source
 from holotorch.experiments.config.version import upgraded
 from holotorch.experiments.kind import ExperimentKind
 from holotorch.io.bundled import find_config
@@ -28,6 +28,23 @@ KINDS = {
 def find_kind(name: str) -> ExperimentKind[Any, Any]:
     """The kind of this name. KeyError for a name that is not in ``KINDS``."""
     return import_module(f"{KINDS[name]}.kind").KIND
+
+
+def run_name(config: Path | str, overrides: list[str], kind: str) -> str:
+    """The name of a run's default folder: that of the user's data in ``overrides``, otherwise of the configuration.
+
+    Data of a file in a format that holds several, such as "a.h5::ct", have the name of the file.
+    """
+    given = Source(Path(config), {})
+    for word in overrides:
+        override(given, word, [])
+    value: Any = given.data
+    for part in find_kind(kind).data.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    path = Path(value.split("::")[0]) if isinstance(value, str) else None
+    if path is None or not path.exists():  # such as the name of a bundled picture
+        return Path(config).stem
+    return path.resolve().name if path.is_dir() else path.stem.removesuffix(".nii")
 
 
 def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:

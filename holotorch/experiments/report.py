@@ -1,12 +1,13 @@
 """One static HTML page for one or more run folders."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.registry import KINDS, find_kind
 from holotorch.experiments.runs.page import page, plain, render
-from holotorch.experiments.runs.record import RunRecord
+from holotorch.experiments.runs.record import SUMMARIES, RunRecord
 from holotorch.io.files import write_text
 
 
@@ -26,9 +27,24 @@ def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | 
     write_text(path, page(title, "\n".join(parts)))
 
 
+def outcome_lines(folder: Path) -> list[str]:
+    """The main numbers of a run in words, and where its pictures are; none for a folder without a summary.
+
+    ConfigError if the summary cannot be read.
+    """
+    lines = []
+    if any((folder / name).is_file() for name in SUMMARIES):
+        with _readable(folder):
+            run = RunRecord(folder)
+            lines += find_kind(run.kind).outcome(run.summary) if run.kind in KINDS else []
+    if any((folder / "images").glob("*.png")):
+        lines.append(f"Pictures   {folder / 'images'}")
+    return lines
+
+
 def _read(folder: Path) -> tuple[RunRecord, str]:
     """The record of a run folder and its section of the page."""
-    try:
+    with _readable(folder):
         run = RunRecord(folder)
         if run.kind not in KINDS:
             existing = folder / "report.html"
@@ -39,6 +55,13 @@ def _read(folder: Path) -> tuple[RunRecord, str]:
         environment = [[key, plain(value)] for key, value in run.env.items()]
         repeat = render("repeat", f"holotorch run {run.folder / 'config.yaml'}", run.config, environment)
         return run, "\n".join([*find_kind(run.kind).section(run), repeat])
+
+
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Context manager that raises ConfigError for what reading the files of a damaged run raises."""
+    try:
+        yield
     except ConfigError:
         raise
     except (OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:

@@ -3,12 +3,15 @@
 import json
 import signal
 
+import cv2
+import numpy as np
 import pytest
+from paths import CONFIGS
 from toy.kind import ToyKind
 
 from holotorch.cli import main
 from holotorch.experiments import registry
-from holotorch.experiments.registry import KINDS, find_kind, load_config
+from holotorch.experiments.registry import KINDS, find_kind, load_config, run_name
 
 
 @pytest.fixture
@@ -24,7 +27,7 @@ def test_a_new_kind_is_checked_run_and_reported(config, tmp_path, capsys):
     assert capsys.readouterr().out == "Steps      5\n"
     folder = tmp_path / "a"
     assert main(["run", config, "--out", str(folder)]) == 0
-    assert capsys.readouterr().out == f"Steps      4\n{folder / 'report.html'}\n"
+    assert capsys.readouterr().out == f"Steps      4\nResult     total 10\n{folder / 'report.html'}\n"
     assert {path.name for path in folder.iterdir()} == {
         *("config.yaml", "env.json", "images", "plan.json", "report.html", "summary.json")
     }
@@ -44,10 +47,15 @@ def test_a_new_kind_goes_on_where_it_was_interrupted(config, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(ToyKind, "step", pressed)
         assert main(["run", config, "--out", str(folder)]) == 130
+    assert capsys.readouterr().out == f"Steps      4\nResult     total 3\n{folder / 'report.html'}\n"
     assert json.loads((folder / "interrupted.json").read_text())["total"] == 3
     assert main(["run", config, "steps=6", "--out", str(folder)]) == 2
     assert "steps was 4 and is 6" in capsys.readouterr().err
     assert main(["resume", str(folder)]) == 0
+    assert capsys.readouterr().out == f"Steps      4\nResult     total 10\n{folder / 'report.html'}\n"
+    assert main(["resume", str(folder)]) == 0
+    complete = "this run is complete; nothing is left to do"
+    assert capsys.readouterr().out == f"{complete}\nResult     total 10\n{folder / 'report.html'}\n"
     assert json.loads((folder / "summary.json").read_text())["total"] == 10
 
 
@@ -102,3 +110,41 @@ def test_unknown_kinds_and_places_are_refused(tmp_path, capsys):
 @pytest.mark.parametrize("name", KINDS)
 def test_every_kind_has_settings_of_its_own_name(name):
     assert find_kind(name).settings.model_fields["experiment"].annotation.__args__ == (name,)
+
+
+@pytest.mark.parametrize(
+    ("config", "word", "name"),
+    [
+        ("pec/fourier.yaml", "target.image=my photo.png", "my photo"),
+        ("pec/fourier.yaml", "target={image: my photo.png}", "my photo"),
+        ("pec/fourier.yaml", "target.image=coffee", "fourier"),  # a bundled picture is not the user's own
+        ("volume/c60.yaml", "volume.path=head.v2.nii.gz", "head.v2"),
+        ("volume/c60.yaml", "volume.path=ct.h5::a/b", "ct"),
+        ("eye/teapot.yaml", "volume={path: slices/}", "slices"),
+        ("joint/teapot.yaml", "volume.path=.", "work"),
+        ("joint/teapot.yaml", "steps=3", "teapot"),
+        ("tracking/track.yaml", "source=my photo.png", "track"),
+        ("perception/layout.yaml", "seed=3", "layout"),
+    ],
+)
+def test_a_run_is_named_after_the_data_of_the_user_or_its_configuration(config, word, name, tmp_path, monkeypatch):
+    (tmp_path / "work" / "slices").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "work")
+    for file in ("my photo.png", "head.v2.nii.gz", "ct.h5"):
+        (tmp_path / "work" / file).touch()
+    kind = {"tracking": "track", "perception": "perception_layout"}.get(folder := config.split("/")[0], folder)
+    assert run_name(f"configs/{config}", ["seed=1", word], kind) == name
+
+
+def test_the_folder_of_a_run_has_the_name_of_the_picture_that_it_shows(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    pixels = np.random.default_rng(0).integers(20, 255, (24, 24, 3), dtype=np.uint8)
+    cv2.imwrite("mine.png", pixels)
+    words = ["target.image=mine.png", "grid.shape=[16,16]", "solver.max_steps=2", "report.baselines=[]"]
+    for number in (1, 2):
+        assert main(["run", str(CONFIGS / "pec" / "fourier.yaml"), *words]) == 0
+        out = capsys.readouterr().out.splitlines()
+        assert out[0].startswith("Picture    mine.png") and out[-1] == f"runs/mine-00{number}/report.html"
+    assert "<title>holotorch: mine-002</title>" in (tmp_path / out[-1]).read_text()
+    assert main(["run", str(CONFIGS / "pec" / "fourier.yaml"), *words, "--out", "there"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "there/report.html"

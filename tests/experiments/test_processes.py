@@ -83,6 +83,8 @@ def run_by_two(tmp_path_factory) -> Path:
     assert job.returncode == 0, text[-2000:]
     for kind in SHARED:
         assert text.count(f"status 0 of {folder / kind}\n") == 2, text[-2000:]
+        assert text.count(f"{folder / kind / 'report.html'}\n") == 1, text[-2000:]
+    assert text.count("Result     ") == len(SHARED) and "\n.\n" not in text and os.devnull not in text
     return folder
 
 

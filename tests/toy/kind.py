@@ -1,6 +1,6 @@
 """A kind of experiment as small as one can be: it counts, and can be interrupted."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -50,6 +50,9 @@ class ToyKind(ExperimentKind[ToySettings, ToySettings]):
 
     def step(self, number: int) -> int:
         return number
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        return [f"Result     total {summary['total']}"]
 
     def section(self, record: RunRecord) -> list[str]:
         return [heading(record.title, record.summary["status"]), element("p", f"total {record.summary['total']}")]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.kind import ExperimentKind
@@ -20,6 +20,7 @@ class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
     settings = ObserverSettings
     example = "configs/eye/teapot.yaml"
     parallel = True
+    data = "volume.path"
 
     def build(self, settings: ObserverSettings) -> Observer:
         from holotorch.experiments.eye.experiment import observer
@@ -51,6 +52,11 @@ class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
 
     def device(self, experiment: Observer) -> str:
         return str(experiment.scene.device)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.eye.report import eye_outcome
+
+        return eye_outcome(summary)
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.eye.report import eye_section

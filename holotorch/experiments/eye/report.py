@@ -1,8 +1,9 @@
 """The section of a report page for what an observer sees."""
 
+from statistics import fmean
 from typing import Any
 
-from holotorch.experiments.planning.errors import error_sentence
+from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -20,6 +21,24 @@ def by_wavelength(row: dict[str, Any], wavelengths: list[float]) -> dict[str, An
         columns = [f"{key}_{wavelength:.0f}nm" for wavelength in wavelengths] if isinstance(value, list) else [key]
         flat |= dict(zip(columns, value if isinstance(value, list) else [value], strict=True))
     return flat
+
+
+def eye_outcome(summary: dict[str, Any]) -> list[str]:
+    """Lines to print: scores of each light source, mean over foci and colours, and the errors of the calculation."""
+    rows: list[dict[str, Any]] = summary.get("rows", [])  # none after an early interruption
+    each = []
+    for source in dict.fromkeys(row["source"] for row in rows):
+        scores = [
+            _mean([v for row in rows if row["source"] == source for v in row[key]]) for key in ("ssim", "contrast")
+        ]
+        each.append("{}: SSIM {}, speckle contrast {}".format(source.replace("_", " "), *scores))
+    text = "Result     of the picture on the retina, against one without speckle, mean over foci and colours: "
+    return [*([text + "; ".join(each)] if each else []), *error_line(summary)]
+
+
+def _mean(values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{fmean(known):.2f}" if known else "-"
 
 
 def eye_section(run: RunRecord) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.joint.config import JointSettings, contradictions
@@ -21,6 +21,7 @@ class JointKind(ExperimentKind[JointSettings, "JointExperiment"]):
     settings = JointSettings
     example = "configs/joint/teapot.yaml"
     parallel = True
+    data = "volume.path"
 
     def contradictions(self, settings: JointSettings) -> list[tuple[Key, str]]:
         return contradictions(settings)
@@ -49,6 +50,11 @@ class JointKind(ExperimentKind[JointSettings, "JointExperiment"]):
 
     def device(self, experiment: JointExperiment) -> str:
         return str(experiment.device)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.joint.report import joint_outcome
+
+        return joint_outcome(summary)
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.joint.report import joint_section

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from holotorch.experiments.joint.names import NAMES, SETS
-from holotorch.experiments.planning.errors import error_sentence
+from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -17,6 +17,20 @@ _PICTURES = {
 
 
 _LITTLE = 0.05  # share of the light in pupil and window below which that is said beside the scores
+
+
+def joint_outcome(summary: dict[str, Any]) -> list[str]:
+    """Lines to print: PSNR of the joint correction and of the best other method, and the errors of the calculation."""
+    methods: dict[str, Any] = summary["methods"]
+    corrected = methods["joint"]
+    scores = [
+        f"{corrected[f'{key}_psnr']:.1f} dB {SETS[key]}" for key in ("stack", "half") if f"{key}_psnr" in corrected
+    ]
+    others = {name: each["stack_psnr"] for name, each in methods.items() if name != "joint"}
+    if others:
+        best = max(others, key=others.__getitem__)
+        scores.append(f"the best other method, {NAMES[best]}: {others[best]:.1f} dB at the corrected foci")
+    return [f"Result     PSNR {'; '.join(scores)}", *error_line(summary)]
 
 
 def joint_section(record: RunRecord) -> list[str]:

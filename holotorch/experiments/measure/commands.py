@@ -36,13 +36,12 @@ def add_measure(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
 
 
 def _measure(options: argparse.Namespace) -> int:
-    from holotorch.experiments.execute import execute
+    from holotorch.experiments.execute import execute, print_outcome
 
     if options.print is not None:
         return _print_sheet(options)
     folder, complete = execute(_settings(options), options.out, "measure")
-    page = folder / "report.html"
-    print(page if page.is_file() else folder)
+    print_outcome(folder)
     return OK if complete else INTERRUPTED
 
 

@@ -65,6 +65,11 @@ class MeasureKind(ExperimentKind[MeasureSettings, "Measurement"]):
 
         return restart_measurement(folder, dict(config))
 
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.measure.report import verdict
+
+        return [verdict(summary)]
+
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.measure.report import measure_section
 

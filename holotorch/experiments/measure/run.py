@@ -13,7 +13,6 @@ from holotorch.experiments.measure.calibration import open_photographs
 from holotorch.experiments.measure.config import GRIDS, SYNTHETIC, MeasureSettings
 from holotorch.experiments.measure.grid import Grid
 from holotorch.experiments.measure.protocols import PROTOCOLS, new_rests
-from holotorch.experiments.measure.report import verdict
 from holotorch.experiments.measure.sheet import chessboard, sheet_rotation
 from holotorch.experiments.measure.source import Source, Track, open_source, read_reference
 from holotorch.experiments.runs.folder import RunFolder, conclude
@@ -131,7 +130,9 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     for name, save in result.saved.items():
         files.write(save, folder.path / name)
     complete = conclude(folder, without_nan(summary), files, done=True)
-    print(verdict(summary), *(note for note in result.notes if note not in announced), sep="\n", flush=True)
+    for note in result.notes:
+        if note not in announced:
+            print(note, flush=True)
     return complete
 
 

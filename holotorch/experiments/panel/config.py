@@ -15,6 +15,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import validated
 from holotorch.experiments.config.settings import Count, GridSettings, Number, Settings, Wavelength
 from holotorch.experiments.config.source import Key, read_source
+from holotorch.io.bundled import find_config
 from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
@@ -72,12 +73,13 @@ class PanelSettings(GridSettings):
 
 
 def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings:
-    """Read the description of a panel, apply ``key=value`` overrides, and check it.
+    """Read the description of a panel, a file or a bundled one, apply ``key=value`` overrides, and check it.
 
     Raises:
         ConfigError: The description has mistakes; the message gives file, line and column of each.
     """
-    source = read_source(Path(path), list(overrides))
+    path = find_config(path) or Path(path)
+    source = read_source(path, list(overrides))
     settings = validated(source, PanelSettings)
     mistakes: list[tuple[Key, str]] = []
     tables: list[CalibrationSettings] = []
@@ -87,7 +89,7 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
             mistakes.append((key, "expected one of full_turn, lut or lut_file"))
             continue
         try:
-            points = _read_points(Path(path).parent / row.lut_file) if row.lut_file else row.lut
+            points = _read_points(path.parent / row.lut_file) if row.lut_file else row.lut
             row = row.model_copy(update={"lut": points, "lut_file": None})
             _table(row, settings.bits)
             tables.append(row)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.kind import ExperimentKind
@@ -22,6 +22,7 @@ class PECKind(ExperimentKind[PECSettings, "PECExperiment"]):
     settings = PECSettings
     example = "configs/pec/fourier.yaml"
     parallel = True
+    data = "target.image"
 
     def contradictions(self, settings: PECSettings) -> list[tuple[Key, str]]:
         return list(contradictions(settings))
@@ -45,6 +46,11 @@ class PECKind(ExperimentKind[PECSettings, "PECExperiment"]):
 
     def device(self, experiment: PECExperiment) -> str:
         return str(experiment.device)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.pec.report import pec_outcome
+
+        return pec_outcome(summary)
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.pec.report import pec_section

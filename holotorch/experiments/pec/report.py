@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from holotorch.experiments.planning.errors import error_sentence
+from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -25,6 +25,21 @@ _FIGURES = {
     "convergence": "Convergence of the solver",
     "weight": "Weight of the squared error, mean 1",
 }
+
+
+def pec_outcome(summary: dict[str, Any]) -> list[str]:
+    """Lines to print: scores with and without correction, heat, and the errors of the calculation."""
+    methods: dict[str, Any] = summary["methods"]
+    corrected, before = methods["corrected"], methods.get("none", {})
+    scores = []
+    for key, name, digits, unit in (("ssim", "SSIM", 3, ""), ("psnr", "PSNR", 1, " dB")):
+        if (value := corrected.get(f"{key}_mean")) is not None:
+            without = _fixed(before.get(f"{key}_mean"), digits)
+            scores.append(
+                f"{name} {_fixed(value, digits)}{unit}" + (f" ({without} without correction)" if without else "")
+            )
+    scores.append(f"hottest pixel {max(corrected['peak_temperature_rise_K']):.0f} degC above ambient")
+    return [f"Result     {', '.join(scores)}", *error_line(summary)]
 
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.kind import ExperimentKind
 from holotorch.experiments.pec.config import SIGMA_MEANING
@@ -40,6 +40,11 @@ class StudyKind(ExperimentKind[StudySettings, "Study"]):
         from holotorch.experiments.pec_study.run import run_study
 
         return run_study(experiment, folder)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.pec_study.report import study_outcome
+
+        return study_outcome(summary)
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.pec_study.report import study_section

@@ -1,9 +1,20 @@
 """Section of the report page for a study of proximity effect correction."""
 
+from typing import Any
+
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec_study.config import METHODS
 from holotorch.experiments.runs.page import element, figure, heading
 from holotorch.experiments.runs.record import RunRecord
+
+
+def study_outcome(summary: dict[str, Any]) -> list[str]:
+    """The line to print for a complete study, whose table the run has printed."""
+    if "rows" not in summary:
+        return []
+    return [
+        f"Result     study of {summary['study']}: {summary['rows']} rows, above and in table.csv; drawn in table.png"
+    ]
 
 
 def study_section(record: RunRecord) -> list[str]:

@@ -59,6 +59,17 @@ def measured_values(measure: Callable[[], Sequence[Comparison]]) -> dict[str, An
         return {}
 
 
+def error_line(summary: dict[str, Any]) -> list[str]:
+    """The errors in a summary as a line to print; none for a summary without any."""
+    if "predicted_error" not in summary:
+        return []
+    predicted, measured = summary["predicted_error"], summary["measured_error"]
+    words = "not measured, which would take too long" if measured is None else f"{100 * measured:.2g} % measured"
+    return [
+        f"Error      of the calculation itself: {words}, {100 * predicted:.2g} % predicted; the report names its parts"
+    ]
+
+
 def error_sentence(summary: dict[str, Any]) -> str:
     """The line of a report about the errors in a summary; empty for a summary without any."""
     parts = []

@@ -9,7 +9,7 @@ from typing import Any
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.io.files import read_json
 
-_SUMMARIES = ("summary.json", "interrupted.json")
+SUMMARIES = ("summary.json", "interrupted.json")
 _LISTED = 6  # run folders that a message lists
 
 
@@ -22,7 +22,7 @@ class RunRecord:
 
     def __init__(self, folder: Path):
         self.folder, self.title = folder, folder.resolve().name
-        names = [name for name in _SUMMARIES if (folder / name).is_file()]
+        names = [name for name in SUMMARIES if (folder / name).is_file()]
         if not names and len(inside := _runs_in(folder)) > 1:
             more = ", ..." if len(inside) > _LISTED else ""
             words = ", ".join(map(str, inside[:_LISTED]))
@@ -57,4 +57,4 @@ class RunRecord:
 
 def _runs_in(folder: Path) -> list[Path]:
     """The folders directly inside ``folder`` that hold a run, as in that of ``holotorch demo`` or of a sweep."""
-    return sorted({path.parent for name in _SUMMARIES for path in folder.glob(f"*/{name}")})
+    return sorted({path.parent for name in SUMMARIES for path in folder.glob(f"*/{name}")})

@@ -55,7 +55,7 @@ def _track(options: argparse.Namespace) -> int:
     from holotorch.experiments.config.errors import ConfigError
     from holotorch.experiments.config.messages import validated
     from holotorch.experiments.config.source import Key, Source, override
-    from holotorch.experiments.execute import execute
+    from holotorch.experiments.execute import execute, print_outcome
     from holotorch.experiments.tracking.config import TrackSettings
 
     given = {"source": options.source, "method": options.method, "record": options.record, "still": options.still}
@@ -70,8 +70,7 @@ def _track(options: argparse.Namespace) -> int:
         raise ConfigError(mistakes)
     settings = validated(source, TrackSettings)
     folder, complete = execute(settings, options.out, "track")
-    page = folder / "report.html"
-    print(page if page.is_file() else folder)
+    print_outcome(folder)
     return OK if complete else INTERRUPTED
 
 

@@ -27,7 +27,7 @@ from holotorch.experiments.tracking.devices import build_headset, headset_covari
 from holotorch.experiments.tracking.forecast import range_text
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
 from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
-from holotorch.experiments.tracking.synthetic import compared, errors, read_truth, synthetic_rig, write_synthetic
+from holotorch.experiments.tracking.synthetic import errors, read_truth, synthetic_rig, write_synthetic
 from holotorch.io.files import append, replacing, without_nan, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
@@ -218,8 +218,9 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
             summary["truth"] = comparison
         if failure is not None:
             summary["failure"] = f"{type(failure).__name__}: {failure}"
-        lines = [verdict(summary), *summary["notes"][printed:], *([compared(comparison)] if comparison else [])]
-        print(*lines, sep="\n", flush=True)
+        # After a failure nothing prints the verdict later.
+        lines = [*([] if failure is None else [verdict(summary)]), *summary["notes"][printed:]]
+        print(*lines, sep="\n", end="\n" if lines else "", flush=True)
         results.write(save_figure, folder, log)
         if failure is not None:
             results.failure = None  # only the first failure is reported

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.kind import ExperimentKind
@@ -21,6 +21,7 @@ class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
     settings = VolumeSettings
     example = "configs/volume/tooth.yaml"
     parallel = True
+    data = "volume.path"
 
     def contradictions(self, settings: VolumeSettings) -> list[tuple[Key, str]]:
         return contradictions(settings)
@@ -49,6 +50,11 @@ class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
 
     def device(self, experiment: VolumeExperiment) -> str:
         return str(experiment.device)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.volume.report import volume_outcome
+
+        return volume_outcome(summary)
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.volume.report import volume_section

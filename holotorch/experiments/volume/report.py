@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from holotorch.experiments.planning.errors import error_sentence
+from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -10,6 +10,22 @@ _CAPTIONS = {
     "rendering": "Direct volume rendering",
     "in_focus": "Hologram, every ray refocused at its own depth",
 }
+
+
+def volume_outcome(summary: dict[str, Any]) -> list[str]:
+    """Lines to print: how the refocused hologram compares with the rendering, and the errors of the calculation."""
+    scores = []
+    if "ssim_in_focus" in summary:
+        scores.append(
+            f"SSIM {summary['ssim_in_focus']:.3f} of the hologram, refocused, with the rendering of the volume"
+        )
+    if summary["speckle_contrast"] is not None:
+        count = summary["realisations"]
+        less = "; the mean of more of them (report.seeds) has less" if count == 1 else ""
+        scores.append(
+            f"speckle contrast {summary['speckle_contrast']:.2f} in {count} realisation(s) of the phases{less}"
+        )
+    return [*([f"Result     {', '.join(scores)}"] if scores else []), *error_line(summary)]
 
 
 def volume_section(record: RunRecord) -> list[str]:

@@ -328,3 +328,8 @@ def test_files_of_another_panel_are_not_taken_for_ones_own(pec, tmp_path):
     names = [report["files"][:3], report["files"][3:]]
     with pytest.raises(ConfigError, match="frame-000_530nm.png was written for another table of levels"):
         resimulate(out, names, wanted, other, (..., slice(4, 36), slice(6, 30)), "png")
+
+
+def test_a_bundled_panel_is_found_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_panel("configs/slm/lcos_2048.yaml", ["pitch=9um"]).pitch == (9e-6, 9e-6)

@@ -56,7 +56,8 @@ def test_track_a_recording_with_its_own_files(recording, capsys):
     assert main(["track", str(recording), "--out", "here", "--no-video"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "here/report.html" and Path("here/report.html").is_file()
-    assert lines[-2].startswith("Truth      the tip is") and "in 2 frames; 0 refused (synthetic)" in lines[-2]
+    assert lines[-2] == "Pictures   here/images"
+    assert lines[-3].startswith("Truth      the tip is") and "in 2 frames; 0 refused (synthetic)" in lines[-3]
     with open("here/poses.csv", newline="") as stream:
         assert [row["status"] for row in csv.DictReader(stream)] == ["OK", "OK"]
     assert not Path("here/overlay.mp4").exists()
@@ -89,7 +90,7 @@ def test_track_the_synthetic_source_renders_it_first(monkeypatch, capsys):
     assert main(["track", "synthetic", "--no-video"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("Source     synthetic: 45 frames") and lines[-1] == "runs/track-001/report.html"
-    assert "in 1 frames; 0 refused" in lines[-2]
+    assert "in 1 frames; 0 refused" in lines[-3] and lines[-2] == "Pictures   runs/track-001/images"
     Path("c.yaml").write_text("fx: 620\nfy: 620\ncx: 480\ncy: 270\nsize: [540, 960]\n")
     assert main(["track", "synthetic", "--no-video", "--camera", "c.yaml", *FILES[2:]]) == 0
     assert "fx: 620" in Path("runs/track-002/synthetic/camera.yaml").read_text()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.kind import ExperimentKind
 from holotorch.experiments.perception.analysis.config import AnalysisSettings
@@ -37,6 +37,11 @@ class AnalysisKind(ExperimentKind[AnalysisSettings, AnalysisSettings]):
         from holotorch.experiments.perception.analysis.run import run_analysis
 
         return run_analysis(experiment, folder)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        from holotorch.experiments.perception.analysis.report import analysis_outcome
+
+        return analysis_outcome(summary)
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.perception.analysis.report import analysis_section

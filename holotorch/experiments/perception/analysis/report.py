@@ -15,6 +15,17 @@ _CAPTIONS = {
 }
 
 
+def analysis_outcome(summary: dict[str, Any]) -> list[str]:
+    """A line to print for each target: the size at which a pattern at the side is perceived as soon as the target."""
+    people = f"{summary['participants']} {'simulated ' if summary['simulated'] else ''}participants"
+    return [
+        f"Result     E deg from the centre, a pattern of {row['alpha']:.3g} E {row['beta']:+.3g} deg is perceived "
+        f"as fast as {row['target']} ({people})"
+        for row in summary["rows"]
+        if row["alpha"] is not None
+    ]
+
+
 def analysis_section(record: RunRecord) -> list[str]:
     """HTML of an analysis: the results in words and numbers, the figures, and the power of the study."""
     summary = record.summary

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holotorch.experiments.kind import ExperimentKind
 from holotorch.experiments.perception.layout.config import LayoutSettings
@@ -35,6 +35,9 @@ class LayoutKind(ExperimentKind[LayoutSettings, "Layouts"]):
         from holotorch.experiments.perception.layout.run import run_layout
 
         return run_layout(experiment, folder)
+
+    def outcome(self, summary: dict[str, Any]) -> list[str]:
+        return list(summary["lines"])
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.perception.layout.report import layout_section

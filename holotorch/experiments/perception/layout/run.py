@@ -107,9 +107,7 @@ def run_layout(layouts: Layouts, opened: RunFolder) -> bool:
         "items": rows,
         "lines": text.splitlines(),
     }
-    complete = conclude(opened, summary, files, done=True)
-    print(text)
-    return complete
+    return conclude(opened, summary, files, done=True)
 
 
 def _centres(settings: LayoutSettings) -> Tensor:
