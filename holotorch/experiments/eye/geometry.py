@@ -81,6 +81,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
     near, far = (f"{z:.4g}" if z else "beyond infinity" for z in values["accommodation_mm"])
     regions = sorted({*values["region_of_centre"], *values["region_of_edge"]})
     meanings = "; ".join(f"{_ROMAN[number]}: {_REGIONS[number]}" for number in regions)
+    meanings += "; this cone is as wide as the pixels can bend light"
     spots = [_span(row) for row in values["smallest_spot_um"]]
     entering = _span([100 * share for share in values["light_of_edge"]])
     lines = [
