@@ -11,6 +11,7 @@ from holotorch.experiments.report import outcome_lines, write_report
 from holotorch.experiments.runs.folder import RunFolder, open_run, tidied
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.processes import joined_processes
+from holotorch.experiments.runs.record import runs_inside
 from holotorch.experiments.runs.signals import interruptible
 from holotorch.io.files import write_bytes, write_json
 
@@ -94,7 +95,10 @@ def resume(folder: Path) -> tuple[Path, bool]:
     """
     config = folder / "config.yaml"
     if not config.is_file() or not (folder / "env.json").is_file():
-        raise ConfigError([f"{folder} holds no run to resume: config.yaml and env.json are not both there"])
+        inside = runs_inside(folder, "holotorch resume {}", lambda run: not (run / "summary.json").is_file())
+        if not inside and runs_inside(folder, ""):
+            inside = "; the runs in it are complete"
+        raise ConfigError([f"{folder} holds no run to resume: config.yaml and env.json are not both there{inside}"])
     if (folder / "summary.json").is_file():
         print("this run is complete; nothing is left to do")
         if tidied(folder):

@@ -81,6 +81,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
     near, far = (f"{z:.4g}" if z else "beyond infinity" for z in values["accommodation_mm"])
     regions = sorted({*values["region_of_centre"], *values["region_of_edge"]})
     meanings = "; ".join(f"{_ROMAN[number]}: {_REGIONS[number]}" for number in regions)
+    meanings += "; this cone is as wide as the pixels can bend light"
     spots = [_span(row) for row in values["smallest_spot_um"]]
     entering = _span([100 * share for share in values["light_of_edge"]])
     lines = [
@@ -97,15 +98,16 @@ def in_words(values: dict[str, Any]) -> list[str]:
 def warnings(values: dict[str, Any]) -> list[str]:
     """Reasons why pictures are dim or incomplete, from the result of :func:`geometry`; a sentence each."""
     lines = []
-    if min(values["light_of_edge"]) < _INVISIBLE:
+    if (least := min(values["light_of_edge"])) < _INVISIBLE:
         lines.append(
             "the edge of the scene is invisible to this eye; enlarge eye.pupil_radius or narrow the scene "
-            "(view.width of its configuration)"
+            f"(view.width of its configuration): {100 * least:.2g} % of the light of the edge enters the pupil, and "
+            f"below {100 * _INVISIBLE:g} % it counts as invisible"
         )
     if (least := min(values["light_in_pupil"])) < _LITTLE:
         lines.append(
-            f"only {100 * least:.2g} % of the light of the scene's centre enters the pupil: pictures are dim; enlarge "
-            "eye.pupil_radius, or move eye or lens"
+            f"only {100 * least:.2g} % of the light of the scene's centre enters the pupil: pictures are dim (below "
+            f"{100 * _LITTLE:g} %); enlarge eye.pupil_radius, or move eye or lens"
         )
     return lines
 

@@ -12,6 +12,7 @@ from holotorch.experiments.volume import plan as volume_plan
 from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.optics.viewing.imaging import retinal_scale
 
+_METHODS = "collapse: eyepiece, eye and the space between as one filter; elements: one after the other, finely sampled"
 # Costs on one core of the reference machine of ``planning.machine``.
 FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}  # seconds per floating-point operation, by method
 _DERIVED_SECONDS = 1e-9  # seconds / (n log2 n) to derive a picture of n samples from that at another wavelength
@@ -138,6 +139,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         where = f" (largest error, at {depth:.4g} mm)" if len(plans) > 1 else ""
         only = f" (focus {', '.join(f'{depth:.4g}' for depth, _ in plans)} mm)" if len(plans) < len(depths) else ""
         lines.append(f"Retina     {worst['reason']}{where}{only}; alternative: {worst['runner_up']}")
+    lines.append(f"Methods    to the retina, by {_METHODS}")
     lines += _cheaper(eye, values["retina"])
     lines += volume_plan.colours_in_words(eye.scene.settings.wavelengths)
     light = "; ".join(
@@ -165,7 +167,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         )
     if settings.tradeoff:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
-        lines.append(f"Trade-off  in addition, at {where} mm, by collapsed propagation; the cost above excludes it")
+        lines.append(f"Trade-off  in addition, at {where} mm, by the method collapse; the cost above excludes it")
     first = len(eye_geometry.warnings(values["geometry"]))  # printed above, with the numbers of the geometry
     return "\n".join([*lines, *(f"WARNING    {warning}" for warning in values["warnings"][first:])])
 

@@ -44,7 +44,8 @@ def joint_section(record: RunRecord) -> list[str]:
     parts += [element("p", note, "warn") for note in plan.get("notes", [])]
     if (light := summary["methods"].get("joint", {}).get("light_in_pupil", 1.0)) < _LITTLE:
         words = (
-            f"Warning: only {light:.1%} of the light reaches the pupil and the window; scores do not count the rest."
+            f"Warning: only {light:.1%} of the light reaches the pupil and the window (said below {_LITTLE:.0%}); "
+            "scores do not count the rest. light_weight asks the solver for more, and a wider eye.pupil takes more."
         )
         parts.append(element("p", words, "warn"))
     parts += [element("p", _WORDS), _methods(summary["methods"])]

@@ -21,6 +21,7 @@ from holotorch.experiments.panel.source import joint_heaters, pec_heaters
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.experiment import build
 from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs.record import kind_of, runs_inside
 from holotorch.io.files import save_array, write_json, write_text
 from holotorch.io.panel_files import write_levels
 from holotorch.modulator import PhasedArray
@@ -144,7 +145,8 @@ def _write(stem: Path, values: Tensor, step: float, about: dict[str, Any]) -> No
 def _load(folder: Path) -> _Chip:
     """The heaters of a run; ConfigError for a folder that has none."""
     if not (folder / "config.yaml").is_file():
-        raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
+        inside = runs_inside(folder, "holotorch export-heaters {}", lambda run: kind_of(run) in ("pec", "joint"))
+        raise ConfigError([f"{folder} holds no run: config.yaml is not there{inside}"])
     settings = load_config(folder / "config.yaml")
     try:
         if isinstance(settings, PECSettings):

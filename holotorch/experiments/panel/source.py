@@ -19,6 +19,7 @@ from holotorch.experiments.joint.methods import Shown
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.experiment import PECExperiment, build
 from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs.record import kind_of, runs_inside
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.hologram import double_phase, encoding_loss, error_diffused, kinoform, refocused
 from holotorch.io.files import read_json
@@ -56,7 +57,9 @@ class PanelPhases:
 def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
     """Phases of a run of kind ``pec``, ``joint`` or ``volume``, from its folder; ConfigError for any other folder."""
     if not (folder / "config.yaml").is_file():
-        raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
+        command = "holotorch export-slm {} --slm FILE"
+        inside = runs_inside(folder, command, lambda run: kind_of(run) in ("pec", "joint", "volume"))
+        raise ConfigError([f"{folder} holds no run: config.yaml is not there{inside}"])
     if encoding is not None and encoding not in ENCODINGS:
         raise ConfigError([f"expected one of {', '.join(ENCODINGS)} as the encoding, got {encoding!r}"])
     settings = load_config(folder / "config.yaml")

@@ -109,7 +109,7 @@ def _verdict(run: RunRecord) -> str:
         "temperature rise that the heaters alone would cause, before the heat spreads; times the number of pixels and "
         "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases. They "
         "are taken at the samples of the image, one per pixel, where the solver controls the light. 'SSIM half a "
-        f"sample off' is the score midway between four samples{speckle}.{single}"
+        f"sample off' is the score midway between four samples{speckle}; a viewer sees that light as well.{single}"
     )
 
 

@@ -104,5 +104,7 @@ class Budget:
         whole = "" if self.tolerance is None else f"{self.tolerance:.1e} = "
         exceeded = ""
         if self.tolerance is not None and self.predicted_error > 1.001 * self.tolerance:
-            exceeded = f"; the prediction of all parts, {self.predicted_error:.1e}, exceeds it"
-        return f"Tolerance  {whole}{' + '.join(parts)}; errors add in squares{exceeded}"
+            exceeded = f"; the run may err by {self.tolerance:.1e} in all, and the prediction exceeds it"
+        words = "allowed relative error of each step" if len(parts) > 1 else "allowed relative error"
+        together = f"; together the root of the sum of their squares, predicted {self.predicted_error:.1e}"
+        return f"Tolerance  {whole}{', '.join(parts)}: {words}{together if len(parts) > 1 else ''}{exceeded}"

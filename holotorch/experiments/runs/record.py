@@ -3,6 +3,9 @@
 import base64
 import csv
 import io
+import re
+import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +23,15 @@ class RunRecord:
     name of the kind of experiment.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(
+        self, folder: Path, command: str = "holotorch report {}", wanted: Callable[[Path], bool] = lambda _: True
+    ):
+        """Read the summary; a message about a folder without one uses the rest as :func:`runs_inside` does."""
         self.folder, self.title = folder, folder.resolve().name
         names = [name for name in SUMMARIES if (folder / name).is_file()]
-        if not names and len(inside := _runs_in(folder)) > 1:
-            more = ", ..." if len(inside) > _LISTED else ""
-            words = ", ".join(map(str, inside[:_LISTED]))
-            raise ConfigError([f"{folder} holds several runs in folders of their own: give one of {words}{more}"])
         if not names:
             hint = f"; finish it with: holotorch resume {folder}" if (folder / "plan.json").is_file() else ""
+            hint = hint or runs_inside(folder, command, wanted)
             raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{hint}"])
         self.summary: dict[str, Any] = read_json(folder / names[0])
         self.kind = str(self.summary["experiment"])
@@ -55,6 +58,36 @@ class RunRecord:
         return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if path.is_file() else ""
 
 
-def _runs_in(folder: Path) -> list[Path]:
-    """The folders directly inside ``folder`` that hold a run, as in that of ``holotorch demo`` or of a sweep."""
-    return sorted({path.parent for name in SUMMARIES for path in folder.glob(f"*/{name}")})
+def runs_inside(folder: Path, command: str, wanted: Callable[[Path], bool] = lambda _: True) -> str:
+    """The end of a message about a folder that holds no run itself: which runs are in it, and what to enter.
+
+    Args:
+        folder: Such as ``runs``, or that of ``holotorch demo`` or of a sweep.
+        command: The command, with {} in place of the folder of a run; the message has that of the latest run.
+        wanted: Whether the command takes the run in a folder.
+
+    Returns:
+        The text after a semicolon; empty if no wanted run is directly inside.
+    """
+    inside = {path.parent for name in SUMMARIES for path in folder.glob(f"*/{name}")}
+    inside |= {path.parent for path in folder.glob("*/config.yaml") if (path.parent / "env.json").is_file()}
+    runs = sorted(run for run in inside if wanted(run))
+    if not runs:
+        return ""
+    names = ", ".join(map(str, runs[:_LISTED])) + (", ..." if len(runs) > _LISTED else "")
+    latest = max(runs, key=_started)
+    return f"; give one of the runs in it: {names}; for the latest: {command.format(shlex.quote(str(latest)))}"
+
+
+def _started(folder: Path) -> float:
+    """When a run was started or resumed; later changes to its folder, such as exports, do not count."""
+    env = folder / "env.json"
+    return (env if env.is_file() else folder).stat().st_mtime
+
+
+def kind_of(folder: Path) -> str:
+    """The kind of the run in a folder, complete or not, as its config.yaml says; empty if it does not."""
+    config = folder / "config.yaml"
+    text = config.read_text(encoding="utf-8", errors="replace") if config.is_file() else ""
+    found = re.search(r"^experiment: *(\w+)", text, re.MULTILINE)
+    return found[1] if found else ""

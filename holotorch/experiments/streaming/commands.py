@@ -88,7 +88,8 @@ def _poses_of(folder: Path) -> Path:
         from holotorch.experiments.config.errors import ConfigError
         from holotorch.experiments.runs.record import RunRecord
 
-        kind = RunRecord(folder).kind
+        command = "holotorch stream --view --replay {}"
+        kind = RunRecord(folder, command, lambda run: (run / "poses.csv").is_file()).kind
         raise ConfigError([f"{folder} holds a run of kind {kind} without poses.csv; --replay takes a run of track"])
     return poses
 

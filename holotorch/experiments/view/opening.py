@@ -5,7 +5,7 @@ from pathlib import Path
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.registry import find_kind, load_config
-from holotorch.experiments.runs.record import RunRecord
+from holotorch.experiments.runs.record import RunRecord, kind_of
 from holotorch.experiments.view.viewer import Viewer
 
 # Module and class of the viewer of each kind that has one.
@@ -20,7 +20,7 @@ VIEWERS = {
 def open_viewer(folder: Path) -> Viewer:
     """The viewer of a finished run. ConfigError for any other folder, or one whose files cannot be used."""
     try:
-        record = RunRecord(folder)
+        record = RunRecord(folder, "holotorch view {}", lambda run: kind_of(run) in VIEWERS)
         status = record.summary["status"]
     except ConfigError:
         raise

@@ -9,6 +9,7 @@ import torch
 from holotorch.core.grid import Grid
 from holotorch.experiments.planning.machine import Machine, machine_speed, seconds_in_words
 from holotorch.experiments.volume.experiment import VolumeExperiment
+from holotorch.experiments.volume.report import EDGES, METHODS
 from holotorch.optics import diffraction_angle
 from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.scene import DVRSampler
@@ -122,8 +123,9 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         divided = "pixels, rays, distances, width and a given number of planes"
         lines.append(f"Scale      1 / {settings.scale} of the configuration: {divided} are divided by {settings.scale}")
     lines += colours_in_words(settings.wavelengths)
+    lines.append(f"Method     {METHODS}")
     for hologram in values["holograms"]:
-        method = hologram["method"] + (f", {hologram['cone']} cone of light" if hologram["near"] else "")
+        method = hologram["method"] + (f"; {EDGES[hologram['cone']]}" if hologram["near"] else "")
         error = f"predicted error {hologram['predicted_error']:.1e}"
         lines.append(f"{hologram['wavelength_nm']:.0f} nm     method: {method} ({error}); {hologram['runner_up']}")
     lines += [
@@ -220,7 +222,7 @@ def dark_picture(experiment: VolumeExperiment) -> list[str]:
         ]
     return [
         f"{100 * (1 - share):.0f} % of the picture is black: SSIM, which compares black with black there, says little; "
-        "look at holotorch check --preview, and change transfer or view.width"
+        f"look at holotorch check --preview, and change transfer or view.width (said above {1 - _DARK:.0%} black)"
     ]
 
 

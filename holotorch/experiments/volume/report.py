@@ -6,6 +6,15 @@ from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
+# What the names of the methods and of the edges of a cone of light mean, for plans and reports.
+METHODS = "axial nodes: a few planes stand for all planes; convolution: the waves of each plane are added by themselves"
+EDGES = {
+    "taper": "each point lights a cone, with a soft edge",
+    "band": "each point lights a cone, with a sharp edge in frequency",
+    "box": "each point lights a rectangular cone, with a sharp edge",
+    "disc": "each point lights a round cone, with a sharp edge",
+    "full": "each point lights all pixels",
+}
 _CAPTIONS = {
     "rendering": "Direct volume rendering",
     "in_focus": "Hologram, every ray refocused at its own depth",
@@ -53,6 +62,8 @@ def volume_section(record: RunRecord) -> list[str]:
     ]
     rows += [[f"{hologram['wavelength_nm']:.0f} nm", plain(hologram)] for hologram in plan["holograms"]]
     parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
+    words = f"{METHODS}. The cone of light of a point is as wide as the pixels can bend light."
+    parts.append(element("p", words[0].upper() + words[1:]))
     return parts + [element("p", note, "warn") for note in plan["notes"]]
 
 

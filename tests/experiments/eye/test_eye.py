@@ -159,7 +159,7 @@ def test_the_plan_names_what_it_does_not_count(capsys):
     assert main(["check", str(CONFIG), *words]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(("Sweep", "Trade-off"))]
     assert lines[0].startswith("Sweep      in addition, 5 depths of focus, 2 realisation(s) each")
-    assert lines[1] == "Trade-off  in addition, at 2, 3 mm, by collapsed propagation; the cost above excludes it"
+    assert lines[1] == "Trade-off  in addition, at 2, 3 mm, by the method collapse; the cost above excludes it"
 
 
 @pytest.mark.parametrize(("tolerance", "method"), [(0.05, "collapse"), (0.03, "elements")])

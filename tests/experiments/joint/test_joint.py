@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.evaluation import errors, evaluate
 from holotorch.experiments.joint.experiment import build
 from holotorch.experiments.joint.methods import Shown, baseline, show
+from holotorch.experiments.joint.report import joint_section
 from holotorch.experiments.registry import load_config
 from holotorch.hologram import incoherent_views
 from holotorch.optics import View, disc_source
@@ -305,3 +307,18 @@ def test_light_in_the_pupil_is_bought_with_accuracy():
     without, with_it = scores(plain, plain.solve().x), scores(bright, bright.solve().x)
     assert with_it["light_in_pupil"] > 1.5 * without["light_in_pupil"]
     assert with_it["stack_psnr"] < without["stack_psnr"]
+
+
+@pytest.mark.parametrize(("light", "said"), [(0.049, True), (0.051, False)])
+def test_a_report_says_that_there_is_little_light_where_that_begins_and_what_to_change(light, said):
+    methods = {"joint": {"light_in_pupil": light, "seconds": 1.0}}
+    record = SimpleNamespace(
+        title="a",
+        summary={"status": "complete", "synthetic": "", "methods": methods},
+        plan={},
+        picture=lambda name: "",
+        rows=lambda name: [],
+    )
+    page = " ".join(joint_section(record))  # type: ignore[arg-type]
+    assert ("only 4.9% of the light reaches the pupil and the window (said below 5%)" in page) == said
+    assert ("light_weight asks the solver for more" in page) == said

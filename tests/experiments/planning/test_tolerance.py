@@ -31,6 +31,10 @@ def test_a_setting_of_a_part_wins_and_counts():
     assert "by one.tolerance" in budget.text and "1.0e-01 = " in budget.text
     spent = Budget(0.1, [Part("one", 1, "one.tolerance", 0.3), Part("two", 1)])
     assert spent.share("two") == pytest.approx(0.1 / math.sqrt(2)) and "exceeds it" in spent.text
+    together = (
+        f"root of the sum of their squares, predicted {math.hypot(*map(spent.error, spent.parts)):.1e}; the run may"
+    )
+    assert together in spent.text and "err by 1.0e-01 in all" in spent.text
     assert spent.values()["tolerances"][0]["from"] == "one.tolerance"
 
 

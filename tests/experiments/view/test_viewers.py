@@ -228,8 +228,10 @@ def test_folders_that_cannot_be_viewed_are_refused(runs, tmp_path, capsys):
     assert "of kind track" in refusal(copy("a", summary_json='{"experiment": "track", "status": "complete"}'))
     unfinished = copy("b", "summary.json", interrupted_json='{"experiment": "volume", "status": "interrupted"}')
     assert "holotorch resume" in refusal(unfinished)
-    several = f"{tmp_path} holds several runs in folders of their own: give one of {tmp_path / 'a'}, {unfinished}\n"
-    assert refusal(tmp_path) == several
+    (tmp_path / "a" / "env.json").touch()  # as one that was started later
+    missing = f"{tmp_path} holds no run: neither summary.json nor interrupted.json is there"
+    several = f"give one of the runs in it: {tmp_path / 'a'}, {unfinished}"
+    assert refusal(tmp_path) == f"{missing}; {several}; for the latest: holotorch view {tmp_path / 'a'}\n"
     assert "hologram.npy is not in its arrays" in refusal(copy("c", "arrays/hologram.npy"))
     assert "cannot be read" in refusal(copy("d", summary_json="{"))
     foreign = copy("e", "arrays/hologram.npy")

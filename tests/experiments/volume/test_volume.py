@@ -147,6 +147,8 @@ def test_the_thesis_scenes_have_its_numbers(name):
     text = plan_text(small, plan_values(small))
     assert "synthetic: a phantom was asked for" in text and "GB of memory" in text
     assert "Scale      1 / 16 of the configuration: pixels, rays, distances" in text
+    assert "Method     axial nodes: a few planes stand for all planes; convolution: " in text
+    assert "nm     method: axial nodes; each point lights a cone, with a soft edge (predicted" in text
     assert "nm     method: " in text and "s refocusing" in text and "s start-up and figures" in text
 
 
