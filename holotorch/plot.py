@@ -29,7 +29,7 @@ def show(
         grid: Sampling, for axes in millimetres; by default the axes count pixels.
         what: "amplitude", "phase", "intensity" or "colour", or several of them. "colour" takes three channels as linear
             red, green and blue. By default amplitude and phase of a complex field, and the intensity of real values.
-        names: Titles of the items.
+        names: Titles of the columns, one for each.
 
     Returns:
         A matplotlib figure; ``figure.savefig("field.png")`` writes it, and a notebook shows it.
@@ -37,7 +37,7 @@ def show(
     Raises:
         TypeError: The values are no tensor.
         ValueError: No image axes, an unknown quantity, "amplitude" or "phase" of real values, "colour" of other than
-            three channels, more names than items, or more than 24 panels.
+            three channels, another number of names than columns, or more than 24 panels.
     """
     from matplotlib.figure import Figure
 
@@ -49,8 +49,9 @@ def show(
     columns = max(len(panels) for _, panels in rows)
     if columns * len(rows) > _MOST:
         raise ValueError(f"values make {columns * len(rows)} panels, more than {_MOST}; show a part of them")
-    if len(names) > columns:
-        raise ValueError(f"expected at most {columns} names, one for each item, got {len(names)}: {list(names)}")
+    if names and len(names) != columns:
+        colour = "; what='colour' shows three channels as one picture" if columns == 3 * len(names) else ""
+        raise ValueError(f"expected {columns} names, one for each panel, got {len(names)}: {list(names)}{colour}")
     figure = Figure(figsize=(3.4 * columns, 3.0 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
     for row, (name, panels) in enumerate(rows):
@@ -60,7 +61,7 @@ def show(
                 panel.set_axis_off()
                 continue
             _draw(figure, panel, name, panels[column], grid)
-            panel.set_title(f"{names[column]}\n{name}" if column < len(names) else name, fontsize=10)
+            panel.set_title(f"{names[column]}\n{name}" if names else name, fontsize=10)
     return figure
 
 

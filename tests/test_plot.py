@@ -60,5 +60,7 @@ def test_refusals(values, what, message):
 def test_arrays_and_names_without_an_item_are_refused():
     with pytest.raises(TypeError, match=r"values must be a torch.Tensor, got ndarray; use torch.from_numpy"):
         show(np.zeros((4, 4)))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"expected at most 2 names, one for each item, got 3: \['a', 'b', 'c'\]"):
+    with pytest.raises(ValueError, match=r"expected 2 names, one for each panel, got 3: \['a', 'b', 'c'\]"):
         show(torch.rand(2, 4, 4), names=["a", "b", "c"])
+    with pytest.raises(ValueError, match=r"expected 6 names, one for each panel, got 2: .*; what='colour' shows"):
+        show(torch.rand(2, 3, 4, 4), what="intensity", names=["a", "b"])

@@ -49,7 +49,7 @@ MEANINGS = {
     "VolumeSource.dtype": "type of number of a raw file, such as uint8 or '>i2'",
     "VolumeSource.unit": "unit of the spacing: metres, or relative if only its ratios are known",
     "TransferSettings.preset": "colours and opacities by name, between low and high",
-    "TransferSettings.low": "value of the volume at which a preset begins",
+    "TransferSettings.low": "value of air or of tissue around, where a preset begins; opacity follows within a third",
     "TransferSettings.high": "value of the volume at which a preset ends",
     "TransferSettings.file": "JSON file of a transfer function, as ParaView exports it",
     "TransferSettings.points": "[value, red, green, blue, opacity] each, values of the volume rising",

@@ -38,6 +38,8 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
             scores.append(
                 f"{name} {_fixed(value, digits)}{unit}" + (f" ({without} without correction)" if without else "")
             )
+    if (between := corrected.get("between_samples", {}).get("ssim_mean")) is not None:
+        scores.append(f"SSIM {_fixed(between, 3)} midway between the samples, which a viewer sees as well")
     scores.append(f"hottest pixel {max(corrected['peak_temperature_rise_K']):.0f} degC above ambient")
     return [f"Result     {', '.join(scores)}", *error_line(summary)]
 

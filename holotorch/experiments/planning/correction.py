@@ -21,6 +21,7 @@ _RESIDUAL = 0.3
 # Error of single precision in the intensity of phases of some rad; 2e-7 to 3e-6 in the same runs.
 _ROUNDING = {torch.float32: 3e-6, torch.float64: 1e-14}
 _FINEST = 1e-7  # relative change of a loss that float32 can still resolve
+_NOISE = 0.05  # negative rise, relative to the warmest, up to which it may be noise of the measurement
 _MARGIN = 4  # taps on each side of the complete kernel, in addition to all taps of at least 1e-6
 
 
@@ -60,7 +61,13 @@ def _cure(rises: Tensor) -> str:
         return ""
     if bool((rises < 0).any()):
         below = rises[rises < 0]
-        return f"; rises are negative ({below.min():g} ... {below.max():g}): subtract the ambient temperature"
+        found = f"; rises are negative ({below.min():g} ... {below.max():g})"
+        if -below.min() > _NOISE * rises.max():
+            return f"{found}: subtract the ambient temperature"
+        return (
+            f"{found}, as noise is: average more measurements, keep only the rows and columns around the heated pixel "
+            "in which the rise is well above the noise, and set what is still below 0 to 0"
+        )
     row, column = divmod(int(rises.argmax()), rises.shape[1])
     down, across = min(row, rises.shape[0] - 1 - row), min(column, rises.shape[1] - 1 - column)
     if (2 * down + 1, 2 * across + 1) == tuple(rises.shape):

@@ -74,7 +74,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
         "predicted_peak_bytes": round(peak),
         "device": str(experiment.device),
         "physics": _physics(experiment),
-        "warnings": [*_shallow(experiment), *dark_picture(experiment)],
+        "warnings": [*_beside_the_scene(experiment), *_shallow(experiment), *dark_picture(experiment)],
         "notes": _notes(experiment, slab_error),
     }
 
@@ -122,6 +122,10 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     if settings.scale > 1:
         divided = "pixels, rays, distances, width and a given number of planes"
         lines.append(f"Scale      1 / {settings.scale} of the configuration: {divided} are divided by {settings.scale}")
+    if experiment.refocus:
+        lines.append(
+            f"Pictures   refocused at {_millimetres(experiment.refocus)}, as report.refocus asks{_by(settings.scale)}"
+        )
     lines += colours_in_words(settings.wavelengths)
     lines.append(f"Method     {METHODS}")
     for hologram in values["holograms"]:
@@ -194,6 +198,28 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     if lost > 0.005:
         notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
     return notes
+
+
+def _beside_the_scene(experiment: VolumeExperiment) -> list[str]:
+    """A warning if no plane lies near a depth at which the hologram is refocused."""
+    nearest, farthest = min(experiment.depths), max(experiment.depths)
+    reach = max(farthest - nearest, 0.1 * farthest) / 4
+    outside = [depth for depth in experiment.refocus if not nearest - reach <= depth <= farthest + reach]
+    if not outside:
+        return []
+    return [
+        f"report.refocus: {_millimetres(outside)}{_by(experiment.settings.scale)} lies beside the scene, which extends "
+        f"from {nearest * 1e3:.4g} to {farthest * 1e3:.4g} mm: pictures there are blurred. SSIM takes each ray from "
+        "the picture that is refocused nearest to it; leave report.refocus out, and depths within the scene are taken"
+    ]
+
+
+def _millimetres(depths: Sequence[float]) -> str:
+    return ", ".join(f"{depth * 1e3:.4g} mm" for depth in depths)
+
+
+def _by(scale: int) -> str:
+    return f" (divided by the scale, {scale})" if scale > 1 else ""
 
 
 def _shallow(experiment: VolumeExperiment) -> list[str]:

@@ -73,6 +73,7 @@ def test_a_kernel_beside_a_sigma_is_told_how_to_take_its_place(tmp_path, capsys)
         ("kernel.csv", "1,2,1\n0,1,0", "; 2 x 3: add or drop a row so that the heated pixel is in the middle"),
         ("kernel.csv", "9,1,0\n1,2,1\n0,1,0", "in row 1, column 1 of the file: it needs neighbours on all sides"),
         ("kernel.csv", "-1,-0.5,-1\n-0.5,-0.2,3\n-1,-0.5,-1", "rises are negative (-1 ... -0.2): subtract the ambient"),
+        ("kernel.csv", "0,1,0\n1,9,1\n0,1,-0.1", "rises are negative (-0.1 ... -0.1), as noise is: average more"),
         ("kernel.csv", "1,0,0\n0,1,0\n0,0,1", "in rows 1, 3 of the file, 2 pixels are as warm as the heated pixel in"),
         (
             "kernel.csv",

@@ -74,3 +74,27 @@ def test_an_eye_sees_an_own_volume_by_the_same_keys(scan, tmp_path, capsys):
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["status"] == "complete"
     assert main(["check", *words, "volume={}"]) == 2
     assert "expected a path, a scene or a phantom" in capsys.readouterr().err
+
+
+def test_the_percentiles_of_a_scan_that_is_mostly_empty_are_those_of_what_is_in_it(tmp_path, capsys):
+    values = np.zeros((20, 20, 20), np.uint8)
+    values[8:12, 8:12, 8:12] = 100 + np.arange(64).reshape(4, 4, 4)  # 0.8 % of all
+    np.save(tmp_path / "vessel.npy", values)
+    scan = f"{{path: {tmp_path / 'vessel.npy'}, spacing: 1, unit: relative}}"
+    words = [*TINY, f"volume={scan}", "transfer={preset: vessels}", "view={width: 0.1 mm}"]
+    assert main(["check", *words, "--preview", str(tmp_path / "look.png")]) == 0
+    out = capsys.readouterr().out
+    assert (
+        "Values     0 to 163; percentiles of the 0.8 % above the smallest 1 %: 100.63" in out and "50 %: 131.5" in out
+    )
+
+
+def test_a_picture_refocused_beside_the_scene_is_announced_with_the_scale(capsys):
+    words = ["configs/volume/tooth.yaml", VOLUME[2], "device=cpu", "scale=4"]
+    scene = find_kind("volume").build(load_config(words[0], words[1:])).depths
+    inside, beside = sum(scene) / len(scene), 2 * max(scene)
+    assert main(["check", *words, f"report.refocus=[{4 * inside}, {4 * beside}]"]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    both = f"{1e3 * inside:.4g} mm, {1e3 * beside:.4g} mm"
+    assert f"refocused at {both}, as report.refocus asks (divided by the scale, 4)" in out
+    assert f"WARNING report.refocus: {1e3 * beside:.4g} mm (divided by the scale, 4) lies beside the scene" in out
