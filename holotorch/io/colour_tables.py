@@ -8,6 +8,9 @@ from torch import Tensor
 
 from holotorch.core import checks
 
+_PRIMARIES = 450e-9, 530e-9, 630e-9  # metres: wavelengths of a picture's blue, green and red, for more than three
+# Shares of red, green and blue that each wavelength shows, longest first, for fewer wavelengths than colours.
+_SHOWN = {1: ((1 / 3, 1 / 3, 1 / 3),), 2: ((0.5, 0.5, 0.0), (0.0, 0.5, 0.5))}
 _LITTLE = 1e-4  # weight of equal powers beside that of the colour, in units of the matching functions
 
 
@@ -102,6 +105,23 @@ def _even_balance(wavelengths: Sequence[float]) -> Tensor:
         listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
         raise ValueError(f"{listed} nm cannot be mixed to the white D65; take red, green and blue ones too")
     return torch.from_numpy(powers / powers.max())
+
+
+def colour_shares(wavelengths: Sequence[float]) -> Tensor:
+    """Shares of a picture's red, green and blue that each of K wavelengths in metres shows, float64 [K, 3].
+
+    Each row adds up to 1. Three wavelengths show red, green and blue, in the order in which they are given; one shows
+    the mean of all. Of two, the longer one shows the mean of red and green and the other one that of green and blue. Of
+    more, 630 nm and longer ones show red, 530 nm green, 450 nm and shorter ones blue, and those between a mixture.
+    """
+    if len(wavelengths) == 3:
+        return torch.eye(3, dtype=torch.float64)
+    if len(wavelengths) > 3:
+        rows = [np.interp(wavelengths, _PRIMARIES, colour) for colour in ((0, 0, 1), (0, 1, 0), (1, 0, 0))]
+        return torch.from_numpy(np.stack(rows, 1))
+    longest_first = sorted(wavelengths, reverse=True)
+    rows = [_SHOWN[len(wavelengths)][longest_first.index(wavelength)] for wavelength in wavelengths]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 def picture_matrix(wavelengths: Sequence[float]) -> Tensor:

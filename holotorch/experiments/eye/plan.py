@@ -5,6 +5,7 @@ from typing import Any
 
 from holotorch.experiments.eye import geometry as eye_geometry
 from holotorch.experiments.eye.experiment import RETINA, Observer
+from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.runs.memory import shortage
 from holotorch.experiments.runs.page import plain
@@ -141,7 +142,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         lines.append(f"Retina     {worst['reason']}{where}{only}; alternative: {worst['runner_up']}")
     lines.append(f"Methods    to the retina, by {_METHODS}")
     lines += _cheaper(eye, values["retina"])
-    lines += volume_plan.colours_in_words(eye.scene.settings.wavelengths)
+    lines += colours_in_words("volume", eye.scene.settings.wavelengths)
     light = "; ".join(
         f"{name}: {plain(values['followed'][name])} of {plain(count)} wavelengths simulated"
         for name, count in values["wavelengths"].items()

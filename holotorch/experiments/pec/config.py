@@ -29,6 +29,8 @@ from holotorch.experiments.config.settings import (
 from holotorch.experiments.config.source import Key
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
 
+_MOST_WAVELENGTHS = 32  # each takes a hologram of its own
+
 
 def _not_zero(value: float) -> float:
     if abs(value) < 1e-6:
@@ -198,8 +200,9 @@ def contradictions(settings: PECSettings) -> Iterator[tuple[Key, str]]:
     """Key and message of each setting that is valid by itself but contradicts another one."""
     shape, light, size = settings.grid.shape, settings.propagator, settings.modulator.kernel_size
     region, weight, scored_by_ssim = settings.target.region, settings.target.weight, "ssim" in settings.report.metrics
-    if len(settings.wavelengths) not in (1, 3):
-        yield ("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {len(settings.wavelengths)}"
+    if not 1 <= (count := len(settings.wavelengths)) <= _MOST_WAVELENGTHS:
+        most = f"another number up to {_MOST_WAVELENGTHS}"
+        yield ("wavelengths",), f"expected 1 (grey), 3 (red, green, blue) or {most}, got {count}"
     if scored_by_ssim and min(shape) < 11:
         hint = "use a larger grid, or report.metrics: [psnr]"
         yield ("grid", "shape"), f"expected at least 11 x 11 px for ssim, got {shape}; {hint}"

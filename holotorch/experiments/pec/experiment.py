@@ -36,6 +36,7 @@ from holotorch.experiments.planning.correction import measured_crosstalk, solver
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.runs.environment import find_device
 from holotorch.experiments.runs.processes import SharedIntensity, process_count
+from holotorch.io.colour_tables import colour_shares, picture_matrix
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
@@ -110,7 +111,7 @@ class PECExperiment:
         """The picture resampled to the grid, or to the region, float64 [all colours, h, w]; computed on first use."""
         settings = self.settings
         fitted = fit_image(self.source, settings.target.region or settings.grid.shape, settings.target.fit)
-        return with_channels(fitted, len(settings.wavelengths)).contiguous()
+        return _on_wavelengths(fitted, settings.wavelengths).contiguous()
 
     @property
     def normalised(self) -> Tensor:
@@ -303,9 +304,14 @@ def build(settings: PECSettings) -> PECExperiment:
     try:
         source = load_image(settings.target.image)
         framed = frame_image(source, shape[1] / shape[0], settings.target.fit)
-        lit = with_channels(framed, len(settings.wavelengths)).amax((-2, -1)) > 0
+        lit = _on_wavelengths(framed, settings.wavelengths).amax((-2, -1)) > 0
     except ValueError as error:
         raise ConfigError([f"target.image: {error}"]) from error
+    if len(settings.wavelengths) not in (1, 3):
+        try:
+            picture_matrix(settings.wavelengths)  # what pictures are drawn with
+        except ValueError as error:
+            raise ConfigError([f"wavelengths: {error}; 1 or 3 wavelengths may have any length"]) from error
     if not lit.any():
         raise ConfigError([f"target.image: {settings.target.image} is black inside its crop; use target.fit: pad"])
     wavelengths = [length for length, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
@@ -315,6 +321,13 @@ def build(settings: PECSettings) -> PECExperiment:
     start = settings.solver.start or ("flat" if isolated else "hot")
     array = PhasedArray(wavelengths, _crosstalk(settings, start), reference_response=settings.modulator.rad_per_K)
     return PECExperiment(settings, source, lit, array, start, find_device(settings.device))
+
+
+def _on_wavelengths(image: Tensor, wavelengths: Sequence[float]) -> Tensor:
+    """What each of K wavelengths shows of a picture [1 or 3, H, W], [K, H, W]; of a single one its luminance."""
+    if len(wavelengths) in (1, 3):
+        return with_channels(image, len(wavelengths))
+    return torch.einsum("kc,chw->khw", colour_shares(wavelengths).to(image), with_channels(image, 3))
 
 
 def _crosstalk(settings: PECSettings, start: str) -> ThermalCrosstalk:

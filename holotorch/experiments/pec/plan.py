@@ -11,6 +11,7 @@ from holotorch.experiments.pec.budget import stop
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import evaluations, padded_samples, seconds_of
+from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
@@ -89,7 +90,7 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     """The plan as text for ``holotorch check`` and ``holotorch run``."""
     settings, physics, crosstalk = experiment.settings, values["physics"], values["crosstalk"]
     height, width = settings.grid.shape
-    colours = "colour" if len(experiment.lit) == 3 else "grey"
+    colours = "grey" if len(experiment.lit) == 1 else "colour"
     wavelengths = ", ".join(f"{wavelength * 1e9:.4g} nm" for wavelength in experiment.wavelengths)
     lines = [
         f"Picture    {settings.target.image}, {colours}, on {height} x {width} px",
@@ -98,6 +99,8 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         f"Light      {wavelengths}; field of view {_listed(physics['field_of_view_deg'], '.2f')} deg across",
         f"Propagator {values['propagator']}, {values['padding']['reason']}",
     ]
+    if len(settings.wavelengths) > 1:  # a single one shows the luminance
+        lines += colours_in_words("picture", settings.wavelengths)
     if "distance_mm" in physics:
         lines.append(
             f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot of each colour"

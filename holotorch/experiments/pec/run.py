@@ -21,7 +21,7 @@ from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
-from holotorch.experiments.runs.pictures import save_picture
+from holotorch.experiments.runs.pictures import in_colour, save_picture
 from holotorch.experiments.runs.processes import collected, from_first, process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
@@ -145,6 +145,8 @@ def _write_results(
     if corrected.isolated is not None and not experiment.isolated:
         shown["isolated"] = corrected.isolated
         captions.append(ISOLATED_NAME + _score(corrected.numbers["isolated"]))
+    if len(experiment.settings.wavelengths) > 1:
+        shown = {name: in_colour(picture, experiment.settings.wavelengths) for name, picture in shown.items()}
     for name, picture in shown.items():
         files.write(save_picture, out / "images" / name, picture)
     names = [f"{wavelength * 1e9:.0f} nm" for wavelength in experiment.wavelengths]

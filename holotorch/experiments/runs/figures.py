@@ -102,7 +102,8 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
     relative = np.maximum((losses / losses[0].clamp(min=1e-30)).cpu().numpy(), 1e-16)
     stage, steps = _next_stage(relative), np.arange(len(relative))
     for i, name in enumerate(names):
-        style = {"linewidth": 1.2, "color": ("#c0392b", "#27864a", "#2867b2")[i % 3]}
+        colour = ("#c0392b", "#27864a", "#2867b2")[i] if len(names) <= 3 else f"C{i}"
+        style = {"linewidth": 1.2, "color": colour}
         axes.semilogy(steps[:stage], relative[:stage, i], label=name, **style)
         if stage:
             axes.semilogy(steps[stage:], relative[stage:, i], **style)

@@ -20,7 +20,7 @@ from holotorch.experiments.runs.environment import find_device
 from holotorch.experiments.volume.config import TransferSettings, VolumeSettings, VolumeSource
 from holotorch.hologram import AxialHologram, ConvolutionHologram, HologramPlan, plan_hologram
 from holotorch.io.catalogue import PUBLISHED, fetch_volume
-from holotorch.io.colour_tables import picture_matrix
+from holotorch.io.colour_tables import colour_shares, picture_matrix
 from holotorch.io.files import read_bytes
 from holotorch.io.volumes import load_volume
 from holotorch.optics import plan_propagation
@@ -38,10 +38,7 @@ _COUNTED = 1_000_000  # largest number of voxels in the histogram
 HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the tolerance of a run
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
-_PRIMARIES = 450e-9, 530e-9, 630e-9  # metres: wavelengths of a volume's blue, green and red, for more than three
 _QUICK_PLANES = 1000  # planes of a quick rendering at most; as many slabs as voxels along the depth are thin enough
-# Shares of red, green and blue that each wavelength shows, longest first, for fewer wavelengths than colours.
-_SHOWN = {1: ((1 / 3, 1 / 3, 1 / 3),), 2: ((0.5, 0.5, 0.0), (0.0, 0.5, 0.5))}
 
 # Arguments in the messages of ``load_volume``, and the settings that stand for them; those named in full come first.
 _SETTINGS = (
@@ -366,13 +363,8 @@ def _shared(transfer: TransferFunction, wavelengths: Sequence[float]) -> Transfe
     """
     if len(wavelengths) == 3:
         return transfer
-    if len(wavelengths) > 3:
-        shares = (np.interp(wavelengths, _PRIMARIES, colour) for colour in ((0, 0, 1), (0, 1, 0), (1, 0, 0)))
-        rows = list(zip(*shares, strict=True))
-    else:
-        longest_first = sorted(wavelengths, reverse=True)
-        rows = [_SHOWN[len(wavelengths)][longest_first.index(wavelength)] for wavelength in wavelengths]
-        rows += rows[-1:] * (3 - len(rows))
+    rows = colour_shares(wavelengths).tolist()
+    rows += rows[-1:] * (3 - len(rows))
     colours = transfer.colours.detach()
     mixed = (colours @ torch.tensor(rows, dtype=colours.dtype).T).clamp(0, 1)
     opacities = transfer.opacities.detach()

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from holotorch.core.grid import Grid
+from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.machine import Machine, machine_speed, seconds_in_words
 from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.experiments.volume.report import EDGES, METHODS
@@ -126,7 +127,7 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         lines.append(
             f"Pictures   refocused at {_millimetres(experiment.refocus)}, as report.refocus asks{_by(settings.scale)}"
         )
-    lines += colours_in_words(settings.wavelengths)
+    lines += colours_in_words("volume", settings.wavelengths)
     lines.append(f"Method     {METHODS}")
     for hologram in values["holograms"]:
         method = hologram["method"] + (f"; {EDGES[hologram['cone']]}" if hologram["near"] else "")
@@ -142,21 +143,6 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     lines += [f"Note       {note}" for note in values["notes"]]
     lines += [f"WARNING    {warning}" for warning in values["warnings"]]
     return "\n".join(lines)
-
-
-def colours_in_words(wavelengths: Sequence[float]) -> list[str]:
-    """Line of a plan that says which colours each wavelength shows; none for three wavelengths."""
-    if len(wavelengths) == 3:
-        return []
-    names = [f"{wavelength * 1e9:.0f} nm" for wavelength in sorted(wavelengths, reverse=True)]
-    if len(names) > 3:
-        shown = f"{len(names)} wavelengths share the volume's colours: 630 nm and longer ones show its red, 530 nm its"
-        rest = "green, 450 nm and shorter ones its blue, those between a mixture; pictures are mixed of all"
-        return [f"Colours    {shown} {rest}"]
-    if len(names) == 1:
-        return [f"Colours    {names[0]} shows the mean of the volume's red, green and blue; pictures of it are grey"]
-    shown = f"{names[0]} shows the mean of the volume's red and green, {names[1]} that of green and blue"
-    return [f"Colours    {shown}; pictures show both in their own colours"]
 
 
 def _physics(experiment: VolumeExperiment) -> dict[str, Any]:

@@ -54,7 +54,11 @@ def mistakes(path: Path, *overrides: str) -> list[str]:
 @pytest.mark.parametrize(
     ("text", "change", "message"),
     [
-        (CORRECTION, "wavelengths=[]", "wavelengths: expected 1 (grey) or 3 (red, green, blue), got 0"),
+        (
+            CORRECTION,
+            "wavelengths=[]",
+            "wavelengths: expected 1 (grey), 3 (red, green, blue) or another number up to 32, got 0",
+        ),
         (
             CORRECTION,
             "wavelengths=1e99999999nm",

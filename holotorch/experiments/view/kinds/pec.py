@@ -13,6 +13,7 @@ from holotorch.core.quantities import SIGMA_PX
 from holotorch.experiments.panel.source import pec_heaters
 from holotorch.experiments.pec.evaluation import observed
 from holotorch.experiments.pec.experiment import PECExperiment
+from holotorch.experiments.runs.pictures import in_colour
 from holotorch.experiments.view.controls import Choice, Slider, span
 from holotorch.experiments.view.viewer import Picture, Shown, Viewer, percent
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
@@ -36,7 +37,7 @@ class PECViewer(Viewer):
         given, kernel = experiment.settings.modulator.sigma_px, experiment.array.crosstalk.kernel
         self._sigma = ThermalCrosstalk.fitted(kernel).sigma_px if given is None else given
         self._heaters = pec_heaters(folder, experiment)[:, experiment.lit].to(experiment.device)
-        self._target = Picture.of("target", "Target", experiment.image)
+        self._target = Picture.of("target", "Target", self._drawn(experiment.image))
         self._at = lru_cache(_REMEMBERED)(self._at_distance)
         # The image at a distance of a single chip is a transform of twice the window.
         factor = 2 if experiment.isolated else 1
@@ -104,7 +105,12 @@ class PECViewer(Viewer):
                 numbers[names[name]] = f"{value:.3f}" if name == "ssim" else f"{value:.1f} dB"
         efficiency = [share for share in scores["efficiency"] if share > 0]
         numbers["light in the picture"] = percent(sum(efficiency) / max(1, len(efficiency)))
-        return Shown([Picture.of("shown", "On the screen", picture), self._target], numbers)
+        return Shown([Picture.of("shown", "On the screen", self._drawn(picture)), self._target], numbers)
+
+    def _drawn(self, picture: Tensor) -> Tensor:
+        """A picture of all colours as it is drawn."""
+        wavelengths = self._experiment.settings.wavelengths
+        return in_colour(picture, wavelengths) if len(wavelengths) > 1 else picture
 
     def _at_distance(self, distance: float | None) -> PECExperiment:
         """The experiment with its image at one distance in millimetres; unchanged for that of the configuration."""
