@@ -132,8 +132,9 @@ def test_a_run_is_named_after_the_data_of_the_user_or_its_configuration(config, 
     monkeypatch.chdir(tmp_path / "work")
     for file in ("my photo.png", "head.v2.nii.gz", "ct.h5"):
         (tmp_path / "work" / file).touch()
+    names = {"tracking": "track", "perception": "perception_layout"}
     folder = config.split("/")[0]
-    kind = {"tracking": "track", "perception": "perception_layout"}.get(folder, folder)
+    kind = names[folder] if folder in names else folder
     assert run_name(f"configs/{config}", ["seed=1", word], kind) == name
 
 
