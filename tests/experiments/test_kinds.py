@@ -132,9 +132,8 @@ def test_a_run_is_named_after_the_data_of_the_user_or_its_configuration(config, 
     monkeypatch.chdir(tmp_path / "work")
     for file in ("my photo.png", "head.v2.nii.gz", "ct.h5"):
         (tmp_path / "work" / file).touch()
-    folder = config.split("/")[0]
-    kind = {"tracking": "track", "perception": "perception_layout"}.get(folder, folder)
-    assert run_name(f"configs/{config}", ["seed=1", word], kind) == name
+    folder = config.split("/")[0].replace("tracking", "track").replace("perception", "perception_layout")
+    assert run_name(f"configs/{config}", ["seed=1", word], folder) == name
 
 
 def test_the_folder_of_a_run_has_the_name_of_the_picture_that_it_shows(tmp_path, monkeypatch, capsys):
