@@ -128,23 +128,14 @@ def even_fft2(quadrant: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.fft.fft(whole, dim=-2)[..., : height // 2 + 1, :]
 
 
-def multiply_even(spectrum: Tensor, quadrant: Tensor, out: Tensor | None = None) -> Tensor:
-    """Product of ``spectrum`` [..., H, W] and an even array, of which ``quadrant`` is the part from index 0 to n // 2.
-
-    It overwrites ``spectrum``, or ``out`` of the shape of ``spectrum``, if given.
-    """
+def multiply_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
+    """Multiply ``spectrum`` [..., H, W] by an even array in place; ``quadrant`` is its part from index 0 to n // 2."""
     height, width = spectrum.shape[-2:]
     right = quadrant[..., 1 : (width + 1) // 2].flip(-1)
     for part, columns in ((quadrant, slice(0, width // 2 + 1)), (right, slice(width // 2 + 1, width))):
-        for factor, rows in (
-            (part, slice(0, height // 2 + 1)),
-            (part[..., 1 : (height + 1) // 2, :].flip(-2), slice(height // 2 + 1, height)),
-        ):
-            if out is None:
-                spectrum[..., rows, columns].mul_(factor)
-            else:
-                torch.mul(spectrum[..., rows, columns], factor, out=out[..., rows, columns])
-    return spectrum if out is None else out
+        spectrum[..., : height // 2 + 1, columns].mul_(part)
+        spectrum[..., height // 2 + 1 :, columns].mul_(part[..., 1 : (height + 1) // 2, :].flip(-2))
+    return spectrum
 
 
 def convolve(image: Tensor, kernel: Tensor) -> Tensor:

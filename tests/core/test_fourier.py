@@ -4,16 +4,7 @@ import torch
 from oracles import dense
 from scipy.signal import convolve2d
 
-from holotorch.core.fourier import (
-    centred_fft2,
-    centred_ifft2,
-    convolve,
-    fft2,
-    filter_spectrum,
-    good_length,
-    ifft2,
-    multiply_even,
-)
+from holotorch.core.fourier import centred_fft2, centred_ifft2, convolve, fft2, filter_spectrum, good_length, ifft2
 
 
 def test_good_length_is_the_next_product_of_two_three_and_five():
@@ -43,18 +34,6 @@ def test_convolution_is_linear_and_centred(size, complex_kernel):
         full = convolve2d(image[i].numpy(), kernel.numpy())
         wanted = full[size[0] // 2 :, size[1] // 2 :][:7, :10]
         np.testing.assert_allclose(out[i], wanted, atol=1e-13)
-
-
-@pytest.mark.parametrize("size", [(8, 9), (7, 6), (1, 2), (3, 1)])
-def test_the_product_with_an_even_array_overwrites_what_it_is_told_to(size):
-    quadrant = torch.randn(2, size[0] // 2 + 1, size[1] // 2 + 1, dtype=torch.complex128)
-    rows, columns = (torch.minimum(torch.arange(n), n - torch.arange(n)) for n in size)
-    expected = (spectrum := torch.randn(3, 2, *size, dtype=torch.complex128)) * quadrant[:, rows][..., columns]
-    before, out = spectrum.clone(), torch.empty_like(spectrum)
-    assert multiply_even(spectrum, quadrant, out) is out
-    torch.testing.assert_close(out, expected, rtol=1e-15, atol=0)
-    assert torch.equal(spectrum, before)
-    assert multiply_even(spectrum, quadrant) is spectrum and torch.equal(spectrum, out)
 
 
 def test_2048_samples_in_single_precision():

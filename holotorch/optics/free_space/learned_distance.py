@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from holotorch.core import checks
-from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.padding import FINEST
 from holotorch.optics.free_space.plane_pair import PlanePair
@@ -177,21 +176,22 @@ def _times_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
     if spectrum.shape[max(0, spectrum.ndim - 2 - len(leading)) : -2] != leading:  # torch.broadcast_shapes takes 8 us
         shape = torch.broadcast_shapes(spectrum.shape[:-2], leading)
         spectrum = spectrum.expand(*shape, *spectrum.shape[-2:])
-    return multiply_even(spectrum, quadrant, spectrum.new_empty(spectrum.shape))
+    height, width = spectrum.shape[-2:]
+    upper, lower = slice(0, height // 2 + 1), slice(height // 2 + 1, height)
+    half = torch.cat([quadrant, quadrant[..., 1 : (width + 1) // 2].flip(-1)], -1)
+    product = spectrum.new_empty(spectrum.shape)
+    torch.mul(spectrum[..., upper, :], half, out=product[..., upper, :])
+    torch.mul(spectrum[..., lower, :], half[..., 1 : (height + 1) // 2, :].flip(-2), out=product[..., lower, :])
+    return product
 
 
 def _dot_even(grad: Tensor, spectrum: Tensor, quadrant: Tensor) -> Tensor:
     """Real part of the scalar product of ``grad`` and :func:`_times_even`, for which no array of their size is made."""
     height, width = grad.shape[-2:]
     upper, lower = slice(0, height // 2 + 1), slice(height // 2 + 1, height)
-    left, right = slice(0, width // 2 + 1), slice(width // 2 + 1, width)
-
-    def product(rows: slice, columns: slice) -> Tensor:
-        return grad[..., rows, columns].conj() * spectrum[..., rows, columns]
-
-    folded = product(upper, left)
-    mirrored = folded[..., 1 : (width + 1) // 2]
-    mirrored += product(upper, right).flip(-1)
-    folded[..., 1 : (height + 1) // 2, :] += product(lower, left).flip(-2)
-    mirrored[..., 1 : (height + 1) // 2, :] += product(lower, right).flip((-2, -1))
+    conjugate = grad.conj()
+    rows = conjugate[..., upper, :] * spectrum[..., upper, :]
+    rows[..., 1 : (height + 1) // 2, :] += (conjugate[..., lower, :] * spectrum[..., lower, :]).flip(-2)
+    folded = rows[..., : width // 2 + 1]
+    folded[..., 1 : (width + 1) // 2] += rows[..., width // 2 + 1 :].flip(-1)
     return torch.vdot(folded.sum_to_size(quadrant.shape).conj().reshape(-1), quadrant.reshape(-1)).real
