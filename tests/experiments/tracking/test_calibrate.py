@@ -227,6 +227,16 @@ CATHETER = "edges: [70 mm, 108 mm, 146 mm, 184 mm]\ncolours: [[200, 40, 45], [40
         (load_catheter, CATHETER + "radius: 1 mm\nlength: 0.1\n", "a.yaml:4:1: length: must reach the last edge"),
         (load_catheter, CATHETER.replace("108", "60") + "radius: 1 mm\nlength: 0.4\n", "a.yaml:1:1: edges: must be"),
         (load_catheter, CATHETER.replace("200", "300") + "radius: 1 mm\nlength: 0.4\n", "a.yaml:2:12: colours.0.0: "),
+        (
+            load_catheter,
+            CATHETER.replace("184 mm", "184 mm, 190 mm, 200 mm") + "radius: 1 mm\nlength: 0.4\n",
+            "a.yaml:2:1: colours: must be one for each band: 6 edges bound 5 bands, got 3 colours; bands touch",
+        ),
+        (
+            load_catheter,
+            CATHETER.replace("[40, 150, 70]", "null") + "radius: 1 mm\nlength: 0.4\n",
+            "colours.1: expected a colour (bands touch each other, so that N colours take N + 1 edges; an unc",
+        ),
         (load_headset, "headset_from_camera: [[1, 0, 0, 0]]\n", "a.yaml:1:"),
         (
             load_headset,
