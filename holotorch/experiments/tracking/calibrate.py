@@ -9,6 +9,7 @@ from statistics import median
 
 import torch
 from pydantic_core import PydanticCustomError
+from torch import Tensor
 
 from holotorch.core.quantities import BOARD_SQUARE
 from holotorch.experiments.config.errors import ConfigError
@@ -16,10 +17,11 @@ from holotorch.experiments.config.settings import metres
 from holotorch.experiments.tracking.devices import save_camera
 from holotorch.io.images import load_image, with_channels
 from holotorch.io.video import PICTURES
-from holotorch.tracking.camera.boards import Charuco, Chessboard, View, describe_board, find_board
+from holotorch.tracking.camera.boards import Charuco, Chessboard, View, chessboard_size, describe_board, find_board
 from holotorch.tracking.camera.calibration import PARAMETERS, Calibration, calibrate
 
 BOARD = ("chessboard", "9x6", "25mm")
+_ADVISED = 3  # photographs at most in which a board of another size is searched
 _KINDS = "chessboard 9x6 25mm (inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250 (squares, square, marker)"
 
 
@@ -46,6 +48,7 @@ def calibrate_photographs(
     mistakes: list[str] = []
     missing: dict[str, str] = {}
     views: list[View] = []
+    boardless: list[Tensor] = []
     sizes: dict[str, tuple[int, int]] = {}
     names = Counter(path.name for path in paths)
     for path in paths:
@@ -63,6 +66,7 @@ def calibrate_photographs(
             views.append(find_board(grey, kind, name))
         except ValueError as error:
             missing[name] = str(error)
+            boardless = [*boardless, grey][:_ADVISED]
     usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
     mistakes += [
         f"{name}: {size[1]} x {size[0]} px, the others have {usual[1]} x {usual[0]}; a calibration takes "
@@ -76,10 +80,25 @@ def calibrate_photographs(
         calibration = calibrate(views, usual)
     except ValueError as error:
         used = f"used {len(views)} of {len(paths)} photographs"
-        raise ConfigError([f"{used}: {error}", *_joined(missing)]) from None
+        advice = [] if views else _advice(kind, boardless)
+        raise ConfigError([f"{used}: {error}", *_joined(missing), *advice]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
     save_camera(out, calibration)
     return calibration, missing
+
+
+def _advice(asked: Chessboard | Charuco, photographs: Sequence[Tensor]) -> list[str]:
+    """A line with the size of the chessboard that photographs, grey uint8 [H, W], show instead of the one asked for."""
+    sizes = Counter(size for size in map(chessboard_size, photographs) if size is not None)
+    if not isinstance(asked, Chessboard) or not sizes:
+        return []
+    (larger, smaller), times = sizes.most_common(1)[0]
+    differ = times == 1 and len(sizes) > 1  # hidden in part, or no chessboards
+    if differ or {larger, smaller} == {asked.columns, asked.rows}:
+        return []
+    board, side = f"--board chessboard {larger}x{smaller}", f"{1e3 * asked.square:g}mm"
+    text = f"the photographs seem to show one of {larger} x {smaller} inner corners"
+    return [f"{text}: {board} {side}, if its squares have sides of {side}"]
 
 
 def parse_board(arguments: Sequence[str]) -> Chessboard | Charuco:

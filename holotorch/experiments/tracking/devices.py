@@ -19,7 +19,7 @@ from holotorch.io.files import write_text
 from holotorch.tracking.camera.calibration import PARAMETERS, Calibration
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.alignment import Alignment
-from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.pose.catheter import NO_GAPS, Catheter
 
 
 def _tone(value: Any) -> Any:
@@ -33,8 +33,15 @@ def _tone(value: Any) -> Any:
     raise PydanticCustomError("tone", "expected srgb, linear, or the light of the 256 levels, rising from 0 to 1")
 
 
+def _colour(value: Any) -> Any:
+    if value is None:
+        raise PydanticCustomError("colour", "a colour ({no_gaps})", {"no_gaps": NO_GAPS})
+    return value
+
+
 Positive = Annotated[Number, Field(gt=0)]
 Level = Annotated[int, BeforeValidator(number), Field(ge=0, le=255)]
+Colour = Annotated[tuple[Level, Level, Level], BeforeValidator(_colour)]
 Row = tuple[Number, Number, Number, Number]
 Row6 = tuple[Number, Number, Number, Number, Number, Number]
 
@@ -74,11 +81,11 @@ class CatheterSettings(Settings):
     """A catheter; see ``Catheter``.
 
     ``edges``: distances of the band edges from the tip, four or more, since those of two bands leave no pose that could
-    be verified. ``colours``: sRGB triples.
+    be verified. ``colours``: sRGB triples, one for each band; bands touch each other, so there is one less than edges.
     """
 
     edges: Annotated[tuple[Annotated[Length, plausible(TOOL_POSITION)], ...], Field(min_length=4)]
-    colours: tuple[tuple[Level, Level, Level], ...]
+    colours: tuple[Colour, ...]
     radius: Annotated[Length, plausible(TOOL_RADIUS)]
     length: Annotated[Length, plausible(TOOL_LENGTH)]
 

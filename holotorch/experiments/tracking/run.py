@@ -26,8 +26,17 @@ from holotorch.experiments.tracking.config import SYNTHETIC, TrackSettings
 from holotorch.experiments.tracking.devices import build_headset, headset_covariance, load_headset
 from holotorch.experiments.tracking.forecast import range_text
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
-from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
-from holotorch.experiments.tracking.synthetic import errors, read_truth, synthetic_rig, write_synthetic
+from holotorch.experiments.tracking.source import Tracker, TrackingInputs, fitting_tracker, open_inputs
+from holotorch.experiments.tracking.synthetic import (
+    distance_text,
+    errors,
+    read_truth,
+    synthetic_distance,
+    synthetic_poses,
+    synthetic_world,
+    write_synthetic,
+)
+from holotorch.io.bundled import find_config
 from holotorch.io.files import append, replacing, without_nan, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
@@ -122,9 +131,18 @@ def build_tracking(settings: TrackSettings) -> TrackingExperiment:
         headset = load_headset(settings.headset)
         to_headset = partial(in_frame, matrix=build_headset(headset), covariance=headset_covariance(headset))
     if settings.source == SYNTHETIC:
+        _check_synthetic(settings)
         return TrackingExperiment(settings, None, {}, to_headset)
     truth = read_truth(Path(settings.source))
     return TrackingExperiment(settings, _open(settings, settings.source), truth, to_headset)
+
+
+def _check_synthetic(settings: TrackSettings) -> None:
+    """ConfigError for a camera and a catheter that cannot be rendered, or that the tracker refuses."""
+    camera, catheter = _files(settings)
+    world = synthetic_world(camera, catheter)
+    fitting_tracker(settings.method, world.camera, world.catheter, catheter and (find_config(catheter) or catheter))
+    synthetic_poses(world, settings.frames, synthetic_distance(world))
 
 
 def _open(settings: TrackSettings, source: str | Path) -> TrackingInputs:
@@ -141,11 +159,11 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     """Describe the source, how far away a tip can be found, and the disk space that a recording needs."""
     settings = experiment.settings
     if experiment.inputs is None:
-        (height, width), camera, catheter = synthetic_rig(*_files(settings))
-        gigabytes = recording_bytes((height, width), settings.frames) / 1e9
+        world = synthetic_world(*_files(settings))
+        (height, width), gigabytes = world.size, recording_bytes(world.size, settings.frames) / 1e9
         size = f"{width} x {height} px, {gigabytes:.2f} GB"
         text = f"Source     synthetic: {settings.frames} frames are rendered first, {size}"
-        return RunPlan(f"{text}\n{range_text(camera, catheter)}")
+        return RunPlan(f"{text}\n{range_text(world.camera, world.catheter)}\n{distance_text(world)}")
     frames = experiment.inputs.frames
     height, width = frames.shape
     count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"

@@ -64,10 +64,7 @@ def open_inputs(
         raise ConfigError(missing)
     lens, tool = _loaded(paths)
     model = devices.build_camera(lens)
-    try:
-        tracker = make_tracker(method, model, tool)
-    except ValueError as error:
-        raise devices.misfit(paths["catheter.yaml"], error) from None
+    tracker = fitting_tracker(method, model, tool, paths["catheter.yaml"])
     try:
         frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
     except ValueError as error:
@@ -108,6 +105,19 @@ def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, Catheter]:
     if mistakes:
         raise ConfigError(mistakes)
     return loaded[0], devices.build_catheter(loaded[1])
+
+
+def fitting_tracker(method: str, camera: Camera, catheter: Catheter, path: Path | None) -> Tracker:
+    """:func:`make_tracker`, with a ConfigError for unsuitable colours at their line in ``path``, the catheter's file.
+
+    Without a file, the catheter is the one of the thesis.
+    """
+    try:
+        return make_tracker(method, camera, catheter)
+    except ValueError as error:
+        if path is None:
+            raise ConfigError([f"the camera does not suit the catheter of the thesis: {error}"]) from None
+        raise devices.misfit(path, error) from None
 
 
 def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:

@@ -9,25 +9,30 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.folder import claim
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.tracking import devices
+from holotorch.experiments.tracking.forecast import working_range
 from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import Recorder, is_recording
 from holotorch.io.video import Frame, replacing_video
-from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.evaluation.protocols import coverage
-from holotorch.tracking.pose.catheter import THESIS, Catheter
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.simulation.cast import Tube
 from holotorch.tracking.simulation.scenery import SKIN, drape, finger
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
 RATE = 30.0  # frames per second
 VIDEO = "video.avi"  # Motion JPEG: unlike MPEG-4 it keeps the band edges sharp enough for every frame
 _SIZE = (1080, 1920)  # (H, W) for a camera without a frame size
+_SWING = 45  # frames after which the motion repeats
+_DISTANCE = 0.5  # metres: usual mean distance of the middle of the bands from the camera
+_SHARE = 0.75  # of the working range: the bands are tilted by up to 23 degrees and swing 6 % farther away
 _TIP, _COVARIANCE = COLUMNS[5:8], COLUMNS[11:17]
 _TRUTH = ("frame", "time_s", *COLUMNS[5:11])  # columns of truth.csv
 _WRONG = 5.0  # mm: error above which a pose counts as wrong
@@ -44,8 +49,9 @@ def write_synthetic(
 ) -> Path:
     """Render a recording with its true poses in ``truth.csv``. Returns the folder.
 
-    A catheter swings over a surgical drape, and skin-coloured fingers pass over its bands. ``holotorch track`` can read
-    the folder, which also contains the rendered camera and catheter. If rendering ends early, the folder is removed.
+    A catheter swings over a surgical drape, at :func:`synthetic_distance`, and skin-coloured fingers pass over its
+    bands. ``holotorch track`` can read the folder, which also contains the rendered camera and catheter. If rendering
+    ends early, the folder is removed.
 
     Args:
         out: New or empty folder.
@@ -58,36 +64,95 @@ def write_synthetic(
     Raises:
         ConfigError: A file cannot be used, the folder is in use, or the catheter would not be in front of the camera.
     """
-    size, model, tool = synthetic_rig(camera, catheter, size)
+    world = synthetic_world(camera, catheter, size)
+    distance = synthetic_distance(world)
+    poses = synthetic_poses(world, frames, distance)
     folder = claim(out, "synthetic")
     try:
-        _render(folder, frames, World(size=size, camera=model, catheter=tool), video)
-    except BaseException as error:
+        _render(folder, poses, world, _DISTANCE / distance, video)
+    except BaseException:
         shutil.rmtree(folder)  # the folder was empty before
-        if isinstance(error, ValueError):
-            raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
         raise
     return folder
 
 
-def synthetic_rig(
-    camera: Path | None, catheter: Path | None, size: tuple[int, int] = _SIZE
-) -> tuple[tuple[int, int], Camera, Catheter]:
-    """(H, W) of the frames, camera and catheter that :func:`write_synthetic` renders. ConfigError for invalid files."""
+def synthetic_world(camera: Path | None, catheter: Path | None, size: tuple[int, int] = _SIZE) -> World:
+    """Frame size, camera and catheter that :func:`write_synthetic` renders. ConfigError for invalid files."""
     settings = None if camera is None else devices.load_camera(find_config(camera) or camera)
     tool = THESIS
     if catheter is not None:
         tool = devices.build_catheter(devices.load_catheter(find_config(catheter) or catheter))
     size = (settings and settings.size) or size
-    return size, synthetic_camera(size) if settings is None else devices.build_camera(settings), tool
+    return World(size, synthetic_camera(size) if settings is None else devices.build_camera(settings), tool)
 
 
-def _render(folder: Path, frames: int, world: World, video: bool) -> None:
+def synthetic_distance(world: World) -> float:
+    """Mean distance in metres of the middle of the bands from the camera.
+
+    It is 0.5 m, or three quarters of :func:`working_range` where that is less. It is not so small that the bands leave
+    the frame or that the tube is too close to be rendered; if that is so up to 0.5 m, it is 0.5 m.
+    """
+    near = _SHARE * working_range(world.camera, world.catheter)[0]
+    if near >= _DISTANCE:
+        return _DISTANCE
+    for step in range(_SWING):
+        distance = near * (_DISTANCE / near) ** (step / _SWING)
+        if all(_in_view(world, *_swing(world, i, distance)) for i in range(0, _SWING, 5)):
+            return distance
+    return _DISTANCE
+
+
+def distance_text(world: World) -> str:
+    """A line with :func:`synthetic_distance` and its reason, to follow that of the working range."""
+    distance, largest = synthetic_distance(world), working_range(world.camera, world.catheter)[0]
+    if _SHARE * largest >= _DISTANCE:
+        reason = "well within that range"
+    elif distance == _SHARE * largest:
+        reason = f"three quarters of that range, since the usual {_DISTANCE:g} m is too close to its end or beyond it"
+    else:
+        reason = "any nearer, its bands would leave the frame, or the tube come within ten radii of the camera"
+        reason += "" if distance < largest else "; this is beyond that range, so few frames or none will have a pose"
+    return f"Distance   the bands of the synthetic catheter are about {distance:.2g} m from the camera: {reason}"
+
+
+def synthetic_poses(world: World, frames: int, distance: float) -> list[tuple[Tensor, Tensor]]:
+    """Tip in metres and direction, float64 [3] each, of each frame. ConfigError if one of them cannot be rendered."""
+    poses = [_swing(world, i, distance) for i in range(frames)]
+    try:
+        for pose in poses[:_SWING]:
+            Tube(world.catheter, *pose, world.look)
+    except ValueError as error:
+        raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
+    return poses
+
+
+def _swing(world: World, frame: int, distance: float) -> tuple[Tensor, Tensor]:
+    phase = 2 * math.pi * frame / _SWING
+    at = (0.05 * math.sin(phase), 0.03 * math.cos(phase))
+    depth = distance + 0.06 * distance * math.sin(phase)
+    return world.pose(depth, math.radians(15 + 8 * math.cos(phase)), 0.4, at)
+
+
+def _in_view(world: World, tip: Tensor, direction: Tensor) -> bool:
+    """Whether all band edges are in the frame, and the tube is not too close to the camera to be rendered."""
+    try:
+        Tube(world.catheter, tip, direction, world.look)
+    except ValueError:
+        return False
+    height, width = world.size
+    x, y = (
+        world.camera.project(tip + world.catheter.positions[:, None] * direction).detach().unbind(-1)
+    )  # NaN behind the camera
+    return bool(((x >= 0) & (x < width) & (y >= 0) & (y < height)).all())
+
+
+def _render(folder: Path, poses: Sequence[tuple[Tensor, Tensor]], world: World, enlarged: float, video: bool) -> None:
     if (folder / "images").is_dir():
         (folder / "images").rmdir()
     size, tool = world.size, world.catheter
     cloth = drape(size, 0, (70, 120, 130))
-    scale = float(world.camera.matrix[0, 0]) / 1400  # the finger's sizes below are for fx = 1400 px
+    # The finger's sizes below are for fx = 1400 px and the usual distance, from which it appears ``enlarged``.
+    scale = float(world.camera.matrix[0, 0]) / 1400 * enlarged
     middle = (tool.edges[0] + tool.edges[-1]) / 2  # metres from the tip
     rows = []
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
@@ -96,13 +161,10 @@ def _render(folder: Path, frames: int, world: World, video: bool) -> None:
         devices.save_catheter(copies["catheter.yaml"], tool)
         movie = replacing_video(folder / VIDEO, size, RATE) if video else nullcontext()
         with Recorder(folder, size, RATE, "synthetic", copies) as recorder, movie as writer:
-            for i in tqdm(range(frames), desc="rendering", unit="frame"):
-                phase = 2 * math.pi * i / 45
-                at = (0.05 * math.sin(phase), 0.03 * math.cos(phase))
-                tip, along = world.pose(0.5 + 0.03 * math.sin(phase), math.radians(15 + 8 * math.cos(phase)), 0.4, at)
+            for i, (tip, along) in enumerate(tqdm(poses, desc="rendering", unit="frame")):
                 x, y = world.camera.project((tip + middle * along)[None])[0].tolist()
                 # A finger covers the middle of the bands in 10 of 45 frames.
-                covered = 20 <= i % 45 < 30
+                covered = 20 <= i % _SWING < 30
                 fingers = finger((x, y - 260 * scale), (x, y + 14 * scale), 16 * scale, SKIN) if covered else ()
                 case = world.case(f"synthetic {i}", (tip, along), lambda: cloth, occluders=tuple(fingers))
                 pixels = case.frame()

@@ -12,6 +12,7 @@ from holotorch.core.quantities import BOARD_SQUARE
 from holotorch.tracking.camera.camera import Camera
 
 _DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
+_ADVICE_PX = 800  # larger side of the picture in which a board of unknown size is searched
 _FEWEST = 8  # least number of corners of a view: 4 determine a homography, the others check it
 
 
@@ -102,13 +103,7 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
     Raises:
         TypeError, ValueError: ``image`` has another type or shape, or does not show the board.
     """
-    if not isinstance(image, Tensor) or image.dtype != torch.uint8:
-        raise TypeError(f"image must be a uint8 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
-    if not (image.ndim == 2 or (image.ndim == 3 and image.shape[0] == 3)) or min(image.shape[-2:]) < 32:
-        raise ValueError(f"image must be [H, W] or [3, H, W] of at least 32 x 32 pixels, got {list(image.shape)}")
-    grey = image.cpu().numpy()
-    if grey.ndim == 3:
-        grey = cv2.cvtColor(np.ascontiguousarray(grey.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY)
+    grey = _grey(image)
     corners = _chessboard(grey, board) if isinstance(board, Chessboard) else _charuco(grey, board)
     if corners is None:
         raise ValueError(
@@ -116,6 +111,31 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
             "margin, in the picture?"
         )
     return View(*map(torch.from_numpy, corners), name=name)
+
+
+def chessboard_size(image: Tensor) -> tuple[int, int] | None:
+    """Numbers of inner corners, the larger one first, of the chessboard that a photograph shows, for advice.
+
+    The search is a fast one in a reduced picture (Duda and Frese 2018). It finds boards of 4 x 4 inner corners or more,
+    and only the visible part of one that is partly hidden; the markers of a ChArUco board often mislead it.
+
+    Args:
+        image: uint8, grey [H, W] or RGB [3, H, W].
+
+    Returns:
+        The size, or None if no chessboard is found.
+
+    Raises:
+        TypeError, ValueError: ``image`` has another type or shape.
+    """
+    grey = _grey(image)
+    if (scale := _ADVICE_PX / max(grey.shape)) < 1:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    found, _, squares = cv2.findChessboardCornersSBWithMeta(grey, (4, 4), flags=cv2.CALIB_CB_LARGER)
+    if not found:
+        return None
+    rows, columns = squares.shape
+    return max(rows, columns), min(rows, columns)
 
 
 def board_rotation(view: View, camera: Camera) -> Tensor:
@@ -138,6 +158,16 @@ def describe_board(board: Chessboard | Charuco) -> str:
     if isinstance(board, Chessboard):
         return f"chessboard of {board.columns} x {board.rows} inner corners"
     return f"ChArUco board of {board.columns} x {board.rows} squares ({board.dictionary})"
+
+
+def _grey(image: Tensor) -> np.ndarray:
+    """Grey levels uint8 [H, W] of a photograph. Raises for another type or shape."""
+    if not isinstance(image, Tensor) or image.dtype != torch.uint8:
+        raise TypeError(f"image must be a uint8 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
+    if not (image.ndim == 2 or (image.ndim == 3 and image.shape[0] == 3)) or min(image.shape[-2:]) < 32:
+        raise ValueError(f"image must be [H, W] or [3, H, W] of at least 32 x 32 pixels, got {list(image.shape)}")
+    grey = image.cpu().numpy()
+    return grey if grey.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(grey.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY)
 
 
 def _chessboard(grey: np.ndarray, board: Chessboard) -> tuple[np.ndarray, np.ndarray] | None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.pose.catheter import NO_GAPS, Catheter
 
 _BITS = 5  # bits of each channel in the index of the table
 _TURN = math.radians(32)  # largest angle between the chroma vectors of a pixel and of its band, in linear light
@@ -42,7 +42,9 @@ class ColourTable:
         chroma, pure = _chroma(camera.linear(cells))
         wanted, saturation = _chroma(camera.linear(torch.tensor(self.colours, dtype=torch.float64)))
         if float(saturation.min()) < 0.2:
-            raise ValueError(f"bands must be of saturated colours, got {self.colours[int(saturation.argmin())]}")
+            least = int(saturation.argmin())
+            hint = f"; {NO_GAPS}" if least in self.bands[1:-1] else ""
+            raise ValueError(f"bands must be of saturated colours, got {self.colours[least]}{hint}")
         between = wanted @ wanted.T - 2 * torch.eye(len(wanted), dtype=torch.float64)
         if float(between.max()) > math.cos(math.radians(25)):
             raise ValueError(f"hues of the bands must lie 25 degrees apart at least, got {self.colours}")

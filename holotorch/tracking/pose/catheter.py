@@ -10,6 +10,11 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.quantities import TOOL_LENGTH, TOOL_POSITION, TOOL_RADIUS
 
+NO_GAPS = (
+    "bands touch each other, so that N colours take N + 1 edges; an uncoloured gap between bands is not supported: "
+    "paint it as a band of its own saturated colour, or paint the bands without gaps"
+)
+
 
 @dataclass(frozen=True)
 class Catheter:
@@ -17,7 +22,7 @@ class Catheter:
 
     Attributes:
         edges: At least 4 distances of the band edges from the tip in metres, increasing. Band i extends from edge i to
-            edge i + 1.
+            edge i + 1, where the next one begins: there are no gaps.
         colours: 8-bit sRGB triples, one for each of the ``len(edges) - 1`` bands; those of neighbours differ.
         radius: Outer radius in metres.
         length: Distance from the tip to the rear end in metres.
@@ -40,7 +45,8 @@ class Catheter:
             raise ValueError(f"edges must be at least 4 rising distances from the tip in metres, got {edges}")
         colours = tuple(tuple(int(value) for value in colour) for colour in self.colours)
         if len(colours) != len(edges) - 1:
-            raise ValueError(f"{len(edges)} edges bound {len(edges) - 1} bands, got {len(colours)} colours")
+            bands = f"{len(edges)} edges bound {len(edges) - 1} bands, got {len(colours)} colours"
+            raise ValueError(f"colours must be one for each band: {bands}; {NO_GAPS}")
         for colour in colours:
             if len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
                 raise ValueError(f"colours must be triples of 8-bit levels, got {colour}")

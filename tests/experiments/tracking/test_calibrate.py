@@ -95,6 +95,40 @@ def test_files_without_a_view_are_refused_with_the_reason(photographs, tmp_path,
         calibrate_photographs([photographs / name for name in files], tmp_path / "camera.yaml", words)
 
 
+def chessboards(folder, shown=(9, 6), count=3):
+    """Photographs of a chessboard of 140 mm that is wholly in each of them."""
+    printed, origin = oracle.chessboard_print(*shown)
+    square = 0.14 / (shown[0] - 1)
+    centre = (0.07, square * (shown[1] - 1) / 2)
+    for i, (turned, at) in enumerate(oracle.handheld(count, centre, tilt=0.5)):
+        cv2.imwrite(str(folder / f"{i}.png"), TAKEN.photograph(printed, origin, square, turned, at, seed=i))
+
+
+@pytest.mark.parametrize("shown", [(9, 6), (7, 5)])
+def test_photographs_of_a_board_of_another_size_say_which(tmp_path, shown):
+    chessboards(tmp_path, shown)
+    with pytest.raises(ConfigError) as caught:
+        calibrate_photographs([tmp_path], tmp_path / "camera.yaml", ("chessboard", "14x10", "20mm"))
+    used, reason, advice = caught.value.mistakes
+    assert used.startswith("used 0 of 3") and "no chessboard of 14 x 10 inner corners found" in reason
+    size = f"{shown[0]} x {shown[1]}"
+    assert advice.startswith(f"the photographs seem to show one of {size} inner corners: --board chessboard")
+    assert f" {shown[0]}x{shown[1]} 20mm" in advice
+
+
+def test_boards_that_differ_or_that_only_some_photographs_show_get_no_advice(tmp_path):
+    for i, shown in enumerate([(9, 6), (7, 5)]):
+        (tmp_path / f"{i}").mkdir()
+        chessboards(tmp_path / f"{i}", shown, count=1)
+    files = [tmp_path / "0", tmp_path / "1"]
+    for words in (("chessboard", "14x10", "20mm"), WORDS):  # neither for a ChArUco board
+        with pytest.raises(ConfigError) as caught:
+            calibrate_photographs(files, tmp_path / "camera.yaml", words)
+        assert "seem to show" not in str(caught.value)
+    found, missing = calibrate_photographs(files, tmp_path / "camera.yaml", ("chessboard", "9x6", "20mm"))
+    assert len(missing) == 1 and "seem to show" not in calibration_text(found, missing)
+
+
 def test_folder_without_pictures_is_named(tmp_path):
     with pytest.raises(ConfigError, match="no pictures"):
         calibrate_photographs([tmp_path], tmp_path / "camera.yaml")
@@ -227,6 +261,16 @@ CATHETER = "edges: [70 mm, 108 mm, 146 mm, 184 mm]\ncolours: [[200, 40, 45], [40
         (load_catheter, CATHETER + "radius: 1 mm\nlength: 0.1\n", "a.yaml:4:1: length: must reach the last edge"),
         (load_catheter, CATHETER.replace("108", "60") + "radius: 1 mm\nlength: 0.4\n", "a.yaml:1:1: edges: must be"),
         (load_catheter, CATHETER.replace("200", "300") + "radius: 1 mm\nlength: 0.4\n", "a.yaml:2:12: colours.0.0: "),
+        (
+            load_catheter,
+            CATHETER.replace("184 mm", "184 mm, 190 mm, 200 mm") + "radius: 1 mm\nlength: 0.4\n",
+            "a.yaml:2:1: colours: must be one for each band: 6 edges bound 5 bands, got 3 colours; bands touch",
+        ),
+        (
+            load_catheter,
+            CATHETER.replace("[40, 150, 70]", "null") + "radius: 1 mm\nlength: 0.4\n",
+            "colours.1: expected a colour (bands touch each other, so that N colours take N + 1 edges; an unc",
+        ),
         (load_headset, "headset_from_camera: [[1, 0, 0, 0]]\n", "a.yaml:1:"),
         (
             load_headset,

@@ -15,11 +15,22 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking import run as tracking_run
 from holotorch.experiments.tracking import synthetic
 from holotorch.experiments.tracking.devices import build_camera, build_catheter, load_camera, load_catheter
-from holotorch.experiments.tracking.synthetic import RATE, compared, errors, read_truth, write_synthetic
+from holotorch.experiments.tracking.forecast import working_range
+from holotorch.experiments.tracking.synthetic import (
+    RATE,
+    compared,
+    distance_text,
+    errors,
+    read_truth,
+    synthetic_distance,
+    synthetic_poses,
+    synthetic_world,
+    write_synthetic,
+)
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.catheter import THESIS
-from holotorch.tracking.simulation.world import synthetic_camera
+from holotorch.tracking.simulation.world import World, synthetic_camera
 
 SIZE = (540, 960)
 
@@ -176,3 +187,65 @@ def test_it_is_rendered_with_the_camera_and_the_catheter_that_were_given(tmp_pat
     with pytest.raises(ConfigError, match="c.yaml"):
         write_synthetic(tmp_path / "more", 1, camera=tmp_path / "none" / "c.yaml")
     assert not (tmp_path / "more").exists()
+
+
+SMALL = "fx: 533\nfy: 533\ncx: 320\ncy: 240\nsize: [480, 640]\n"
+COLOURS = "colours: [[200, 40, 45], [40, 150, 70], [40, 70, 190]]\n"
+
+
+def small(folder, bands):
+    """A small camera and a catheter with ``bands``, as files of ``folder``."""
+    (folder / "c.yaml").write_text(SMALL)
+    (folder / "t.yaml").write_text(bands + COLOURS)
+    return folder / "c.yaml", folder / "t.yaml"
+
+
+def test_the_usual_camera_and_catheter_stay_where_they_were():
+    world = World()
+    assert synthetic_distance(world) == 0.5 and "0.5 m from the camera: well within" in distance_text(world)
+    poses = synthetic_poses(world, 90, 0.5)
+    assert len(poses) == 90
+    for i, pose in enumerate(poses):
+        phase = 2 * math.pi * i / 45
+        at = 0.05 * math.sin(phase), 0.03 * math.cos(phase)
+        true = world.pose(0.5 + 0.03 * math.sin(phase), math.radians(15 + 8 * math.cos(phase)), 0.4, at)
+        assert all(torch.equal(one, other) for one, other in zip(pose, true, strict=True))
+
+
+def test_short_bands_before_a_small_camera_come_nearer_and_are_found(tmp_path, capsys):
+    files = small(tmp_path, "edges: [10 mm, 18 mm, 26 mm, 34 mm]\nradius: 1 mm\nlength: 120 mm\n")
+    largest, _ = working_range(*(getattr(synthetic_world(*files), name) for name in ("camera", "catheter")))
+    assert largest < 0.2
+    given = {"camera": str(files[0]), "catheter": str(files[1])}
+    out, _ = track(tmp_path / "run", "synthetic", frames=4, video=False, **given)
+    found = json.loads((out / "summary.json").read_text())
+    assert found["answered"] == 4 and found["truth"]["worst_mm"] < 1
+    rows = truths(out / "synthetic")
+    assert all(float(row["tip_z_m"]) < 1.1 * largest for row in rows)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Distance")]
+    assert f"about {0.75 * largest:.2g} m from the camera: three quarters of that range" in line
+
+
+def test_bands_too_long_to_be_seen_within_the_range_stay_in_the_frame_and_say_so(tmp_path):
+    """Thin, so that the range is 0.22 m, from which bands of 240 mm do not fit into 62 degrees."""
+    files = small(tmp_path, "edges: [10 mm, 90 mm, 170 mm, 250 mm]\nradius: 0.5 mm\nlength: 260 mm\n")
+    world = synthetic_world(*files)
+    distance = synthetic_distance(world)
+    assert working_range(world.camera, world.catheter)[0] < distance < 0.5
+    assert "its bands would leave the frame" in distance_text(world) and "beyond that range" in distance_text(world)
+
+    def inside(distance):
+        poses = synthetic_poses(world, 45, distance)
+        edges = torch.stack([tip + world.catheter.positions[:, None] * along for tip, along in poses])
+        return bool(((edges[..., :2] / edges[..., 2:]).abs() < torch.tensor([320, 240]) / 533).all())
+
+    assert inside(1.01 * distance) and not inside(0.9 * distance)
+
+
+def test_a_catheter_that_cannot_be_rendered_is_refused_before_a_folder_is_made(tmp_path):
+    files = small(tmp_path, "edges: [10 mm, 120 mm, 230 mm, 340 mm]\nradius: 50 mm\nlength: 400 mm\n")
+    with pytest.raises(ConfigError, match="cannot be rendered with this camera: the tube comes within"):
+        track(tmp_path / "run", "synthetic", frames=1, camera=str(files[0]), catheter=str(files[1]))
+    with pytest.raises(ConfigError, match="cannot be rendered"):
+        write_synthetic(tmp_path / "made", 1, camera=files[0], catheter=files[1])
+    assert {path.name for path in tmp_path.iterdir()} == {"c.yaml", "t.yaml"}

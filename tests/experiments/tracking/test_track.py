@@ -196,6 +196,8 @@ def test_a_catheter_that_no_tracker_sees_is_refused_before_anything_is_written(t
     line = text[: text.index("colours:")].count("\n") + 1
     with pytest.raises(ConfigError, match=f"catheter.yaml:{line}:1: colours: .*{message}"):
         tracked(tmp_path, source, method=method)
+    with pytest.raises(ConfigError, match=f"catheter.yaml:{line}:1: colours: .*{message}"):
+        tracked(tmp_path, "synthetic", method=method, frames=1)
     assert not (tmp_path / "out").exists()
     if method == "ours":
         with pytest.raises(ConfigError, match=message):

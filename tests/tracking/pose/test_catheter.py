@@ -34,7 +34,7 @@ def test_any_spacing_and_number():
         ({"edges": (-0.01, 0.07, 0.108, 0.184)}, "at least 4 rising distances"),
         ({"edges": (0.07, float("nan"), 0.108, 0.184)}, "edges must be finite"),
         ({"edges": (70.0, 108.0, 146.0, 184.0), "length": 350.0}, "edges must lie within -3 m .. 3 m, got"),
-        ({"colours": (RED, GREEN)}, "4 edges bound 3 bands, got 2 colours"),
+        ({"colours": (RED, GREEN)}, "4 edges bound 3 bands, got 2 colours; bands touch each other, so that N colours"),
         ({"colours": (RED, GREEN, (40, 70))}, r"triples of 8-bit levels, got \(40, 70\)"),
         ({"colours": (RED, GREEN, (40, 70, 256))}, "triples of 8-bit levels"),
         ({"colours": (RED, GREEN, (40, 70, -1))}, "triples of 8-bit levels"),
