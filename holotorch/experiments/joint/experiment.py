@@ -15,7 +15,6 @@ from holotorch.core.grid import Grid
 from holotorch.correction import (
     LBFGS,
     PECProblem,
-    ProjectedAdam,
     Solution,
     deconvolve,
     limit_peak_phase,
@@ -26,7 +25,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.joint import budget as shares
 from holotorch.experiments.joint.config import FOCI_PER_STEP, JointSettings, volume_settings
 from holotorch.experiments.joint.views import pupils
-from holotorch.experiments.joint.views.sampled import Group, SampledViews
+from holotorch.experiments.joint.views.sampled import Group, SampledViews, adam
 from holotorch.experiments.planning.correction import PROPAGATION, measured_crosstalk
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.runs.processes import SharedIntensity, process_count
@@ -43,9 +42,6 @@ _PENALTY_FROM = 0.985  # fraction of the limit above which phases are penalised,
 _TOLERANCE = 3e-3  # relative L2 error of the fields that the start is made of
 _RINGS = 2  # rings of directions within a pupil, for the occlusion between planes
 _VIEWS_SEED = 1 << 40  # added to the seed for the random pupils, so that they are independent of the start
-_LEARNING_RATE = 0.15  # rad, of Adam
-_BETAS = 0.9, 0.99  # of Adam; its square of the gradient follows that of about 100 steps
-_FINAL = 0.01  # learning rate of the last step relative to the first
 
 
 @dataclass(frozen=True)
@@ -336,7 +332,7 @@ class JointExperiment:
         whole, parts = range(len(self.foci)), range(len(self.foci), len(self.trained.operator.views))
         groups = [Group(whole, min(FOCI_PER_STEP, len(whole))), Group(parts, per_step)]
         loss = self.sampled(heat, self.trained, groups, limit)
-        return self.adam(self.settings.steps)(loss, start, callback=progress, resume=resume)
+        return adam(self.settings.steps)(loss, start, callback=progress, resume=resume)
 
     def sampled(
         self, heat: ThermalCrosstalk | HeatCycle, views: Views, groups: Sequence[Group], limit: float | None
@@ -347,10 +343,6 @@ class JointExperiment:
             return self.problem(heat, views.select(drawn), limit, shared=True)
 
         return SampledViews(problem, groups, self.settings.seed + _VIEWS_SEED)
-
-    def adam(self, steps: int) -> ProjectedAdam:
-        """The solver for views that are drawn at random in each step."""
-        return ProjectedAdam(_LEARNING_RATE, _BETAS, _FINAL, max_steps=steps, tolerance=0.0)
 
     def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
         """Heater phases [F, C, H, W] that form all views at once, from the kinoforms of random fields.

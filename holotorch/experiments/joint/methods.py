@@ -9,13 +9,12 @@ from holotorch.core.complex import intensity
 from holotorch.correction import deconvolve, gerchberg_saxton, iterative_pec
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.joint.experiment import JointExperiment
-from holotorch.experiments.joint.views.sampled import Group
+from holotorch.experiments.joint.views.sampled import STEPS_OF_ADAM, Group, adam
 from holotorch.experiments.runs.processes import added, process_count
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics.viewing.pupil_views import PupilViews
 
 CIRCLES = 64  # smaller pupils of the light field
-STEPS_OF_ADAM = 3  # of some of the views, for each step of L-BFGS with all
 
 SHARED = ("unheated", "light_field", "slabs")  # methods whose work several processes divide
 
@@ -73,7 +72,7 @@ def _light_field(experiment: JointExperiment) -> Tensor:
     steps = experiment.settings.steps * (STEPS_OF_ADAM if experiment.settings.eye.per_step is None else 1)
     start = experiment.kinoform(experiment.random_fields(), cold)
     loss = experiment.sampled(cold, views, [group], None)
-    return _corrected(experiment, experiment.adam(steps)(loss, start).x)
+    return _corrected(experiment, adam(steps)(loss, start).x)
 
 
 def _corrected(experiment: JointExperiment, phase: Tensor) -> Tensor:

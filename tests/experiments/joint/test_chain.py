@@ -1,5 +1,7 @@
 """The joint correction through display and eye, in a tiny form, and its wanted images."""
 
+import csv
+
 import pytest
 import torch
 
@@ -14,7 +16,7 @@ from holotorch.optics import Display, Eye, Retina, RetinaViews
 @pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")
 def test_a_small_chain_is_complete_and_ahead(tmp_path, monkeypatch, capsys):
     for name, value in {
-        "FULL": chain.Amount(size=96, frames=2, steps=6, checked=9),
+        "FULL": chain.Amount(size=96, frames=2, steps=6, seeds=(7, 8), checked=9),
         "PLANES": 3,
         "TRAINED": 2,
         "SOURCES": {None: "one wavelength"},
@@ -32,9 +34,14 @@ def test_a_small_chain_is_complete_and_ahead(tmp_path, monkeypatch, capsys):
     out = capsys.readouterr().out
     deviation = float(out.partition("differs from them by ")[2].split()[0])
     assert deviation == pytest.approx(9**-0.5, rel=0.15)  # what the mean of nine differs from the exact one by
-    scores = [float(line.partition("SSIM ")[2].split(",")[0]) for line in out.splitlines() if "; shown: " in line]
-    one_wavelength, sled, *others = scores
-    assert min(one_wavelength, sled) > max(others) + 0.05
+    lines = [line.partition("SSIM ")[2].split()[:2] for line in out.splitlines() if "; shown: " in line]
+    means, worst = ([float(words[k].strip("(),")) for words in lines] for k in (0, 1))
+    assert all(low <= mean for low, mean in zip(worst, means, strict=True)) and worst != means
+    one_wavelength, sled, light_field, *others = means
+    assert min(one_wavelength, sled, light_field) > max(others) + 0.05 and one_wavelength > light_field
+    with (tmp_path / "c" / "chart.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["seed"] for row in rows] == ["7"] * 5 + ["8"] * 5
 
 
 def test_a_magnified_picture_keeps_its_light_and_its_middle():

@@ -1,6 +1,7 @@
 """Chart of the joint correction through a whole display: eyepiece, eye and light source, in three colours."""
 
 import math
+import statistics
 import time
 import warnings
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from holotorch.correction import LBFGS, PECProblem, Solution, deconvolve, limit_
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
 from holotorch.experiments.joint.charts.chart import volume_file
+from holotorch.experiments.joint.names import NAMES
+from holotorch.experiments.joint.views.sampled import STEPS_OF_ADAM, Group, SampledViews, adam
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs.figures import picture_table
 from holotorch.experiments.runs.memory import peak_memory
@@ -29,8 +32,8 @@ from holotorch.optics.viewing.imaging import retinal_scale
 
 PITCH, DISTANCE, PLANES = "3.74 um", "30 mm", 5
 SIGMA, LIMIT = 0.66, 4 * math.pi
-SEED = 7
 SOURCES = {None: "one wavelength", "sled": "SLED"}
+_MEANS = "ssim", "psnr", "contrast", "light_on_retina"
 TRAINED = 5  # wavelengths of each SLED in the problem; the scores use 9 to 15, of which 3 are propagated
 
 
@@ -41,11 +44,24 @@ class Amount:
     size: int = 512  # pixels along each side of the array
     frames: int = 8
     steps: int = 30
+    seeds: tuple[int, ...] = (7, 8, 9)
     checked: int = 32  # random-phase holograms whose mean the wanted images are compared with
 
 
 FULL = Amount()
-QUICK = Amount(size=128, frames=2, steps=4, checked=4)
+QUICK = Amount(size=128, frames=2, steps=4, seeds=(7,), checked=4)
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """Display, eye and light sources of the chart, and what is wanted on the retina."""
+
+    eye: Observer
+    foci: list[float]
+    views: RetinaViews  # for one wavelength of each colour
+    spectral: RetinaViews  # for the light of the SLED
+    wanted: Tensor  # [C, V, H, W]
+    crosstalk: ThermalCrosstalk
 
 
 def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
@@ -56,35 +72,61 @@ def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[
     foci = sorted(eye.scene.depths)[:: max(1, (PLANES - 1) // 2)]
     wavelengths, optics = eye.scene.settings.wavelengths, [(eye.display, eye.eye(z)) for z in foci]
     retinas = [Retina(eye.scene.grid, wavelengths, *each, plane=z) for each, z in zip(optics, foci, strict=True)]
-    views, wanted = RetinaViews(retinas), _wanted(eye, retinas, foci)
     spectra = [PRESETS["sled"](each).samples(TRAINED) for each in wavelengths]
     spectral = [SpectralRetina(eye.scene.grid, spectra, *each, recompute=True) for each in optics]
-    crosstalk = ThermalCrosstalk(SIGMA)
-    generator = torch.Generator().manual_seed(SEED)
-    fields = torch.stack([_random_field(eye, generator) for _ in range(amount.frames)])
-    start = deconvolve(crosstalk, fields.angle() % (2 * math.pi) + math.pi)
-    cost, largest = [], 0.0
-    methods = {}
-    for light, operator in ("one wavelength", views), ("SLED", RetinaViews(spectral)):
-        phase, numbers = _corrected(crosstalk, operator, wanted, start, light, amount.steps)
-        cost.append(numbers)
-        largest = max(largest, crosstalk(phase).max().item() / math.pi)
-        methods[f"joint correction for {light}"] = phasor(crosstalk(phase))
-    methods["random phases, corrected afterwards"] = phasor(crosstalk(start))
-    methods["ideal complex fields, random phases averaged"] = fields
-    rows, shown = [], {"wanted": wanted}
-    for name, emitted in methods.items():
-        for source, light in SOURCES.items():
-            numbers, images = _scores(eye, emitted, source, foci, views, wanted)
-            rows.append({"method": name, "light": light} | numbers)
-            shown[f"{name}, shown: {light}"] = images
-    deviation = _deviation(eye, views, wanted, amount.checked)
+    wanted = _wanted(eye, retinas, foci)
+    setup = _Setup(eye, foci, RetinaViews(retinas), RetinaViews(spectral), wanted, ThermalCrosstalk(SIGMA))
+    rows, cost, largest, shown = [], [], 0.0, {"wanted": wanted}
+    for seed in amount.seeds:
+        methods, costs, warmest = _methods(setup, seed, amount)
+        cost += costs
+        largest = max(largest, warmest)
+        for name, emitted in methods.items():
+            for source, light in SOURCES.items():
+                numbers, images = _scores(setup, emitted, source)
+                rows.append({"method": name, "light": light, "seed": seed} | numbers)
+                shown.setdefault(f"{name}, shown: {light}", images)
+    deviation = _deviation(setup, amount)
     text = [_headline(rows), *_setup(eye, retinas, deviation, largest, amount), *_lines(rows, cost)]
     peak = wanted.amax()
     pixels = {name: tone_map(each.movedim(1, 0), peak=peak).movedim(0, 1) for name, each in shown.items()}
     short = {name.replace("joint correction ", "joint, "): each for name, each in pixels.items()}
     drawn = {"chart": picture_table(short, [f"{focus * 1e3:.4g} mm" for focus in foci])}
     return rows, {"cost": cost}, drawn, text
+
+
+def _methods(setup: _Setup, seed: int, amount: Amount) -> tuple[dict[str, Tensor], list[dict[str, Any]], float]:
+    """Fields [F, C, H, W] that each method emits, the cost of the joint corrections, and their largest phase in pi."""
+    generator, crosstalk = torch.Generator().manual_seed(seed), setup.crosstalk
+    fields = torch.stack([_random_field(setup.eye, generator) for _ in range(amount.frames)])
+    start = fields.angle() % (2 * math.pi) + math.pi
+    cold = deconvolve(crosstalk, start)
+    methods, cost, largest = {}, [], 0.0
+    for light, operator in ("one wavelength", setup.views), ("SLED", setup.spectral):
+        phase, numbers = _corrected(crosstalk, operator, setup.wanted, cold, light, amount.steps)
+        cost.append(numbers | {"seed": seed})
+        largest = max(largest, crosstalk(phase).max().item() / math.pi)
+        methods[f"joint correction for {light}"] = phasor(crosstalk(phase))
+    light_field = limit_peak_phase(LIMIT, _light_field(setup, start, seed, amount.steps), crosstalk)
+    methods[NAMES["light_field"]] = phasor(crosstalk(light_field))
+    methods[NAMES["afterwards"]] = phasor(crosstalk(cold))
+    methods[NAMES["random"]] = fields
+    return methods, cost, largest
+
+
+def _light_field(setup: _Setup, start: Tensor, seed: int, steps: int) -> Tensor:
+    """Heater phases [F, C, H, W] by one random focus in each step of Adam without heat, corrected afterwards."""
+    unheated = ThermalCrosstalk(0.0)
+
+    def problem(drawn: list[int]) -> PECProblem:
+        views = RetinaViews([setup.views.retinas[v] for v in drawn])
+        return PECProblem(unheated, views, setup.wanted[:, drawn], frames=True, amplitude=True, scale_free=True)
+
+    loss = SampledViews(problem, [Group(range(len(setup.foci)), 1)], seed)
+    steps *= STEPS_OF_ADAM
+    with tqdm(total=steps, desc="chain, light field", unit="step", dynamic_ncols=True) as bar:
+        phase = adam(steps)(loss, start, callback=lambda _: bar.update() and None).x
+    return deconvolve(setup.crosstalk, phase % (2 * math.pi) + math.pi)
 
 
 def _corrected(
@@ -162,26 +204,25 @@ def _scaled(image: Tensor, scale: float) -> Tensor:
     return moved / scale**2
 
 
-def _deviation(eye: Observer, views: RetinaViews, wanted: Tensor, checked: int) -> float:
+def _deviation(setup: _Setup, amount: Amount) -> float:
     """Relative difference of the wanted images from the mean of random-phase holograms."""
-    generator = torch.Generator().manual_seed(SEED + 1)
-    total = torch.zeros_like(wanted)
+    generator = torch.Generator().manual_seed(amount.seeds[0] + 1)
+    total, wanted = torch.zeros_like(setup.wanted), setup.wanted
     with torch.no_grad():
-        for _ in tqdm(range(checked), desc="checking the wanted images", unit="hologram", dynamic_ncols=True):
-            total += views(_random_field(eye, generator))
+        for _ in tqdm(range(amount.checked), desc="checking the wanted images", unit="hologram", dynamic_ncols=True):
+            total += setup.views(_random_field(setup.eye, generator))
     total *= best_scale(total, wanted, -3)[:, None, None, None]
     return ((total - wanted).norm() / wanted.norm()).item()
 
 
-def _scores(
-    eye: Observer, emitted: Tensor, source: str | None, foci: list[float], views: RetinaViews, wanted: Tensor
-) -> tuple[dict[str, Any], Tensor]:
+def _scores(setup: _Setup, emitted: Tensor, source: str | None) -> tuple[dict[str, Any], Tensor]:
     """Scores of fields [F, C, H, W] under a light source, and their images, scaled as wanted."""
+    views, wanted = setup.views, setup.wanted
     with torch.no_grad():
         if source is None:
             observed = torch.stack([views(each) for each in emitted]).mean(0)
         else:
-            frames = [[eye.image(each.conj(), source, focus) for focus in foci] for each in emitted]
+            frames = [[setup.eye.image(each.conj(), source, focus) for focus in setup.foci] for each in emitted]
             observed = torch.stack([torch.stack(each, 1) for each in frames]).mean(0)
         arrives = views(emitted[0]).sum((-2, -1)).mean(-1) / intensity(emitted[0]).sum((-2, -1))
     observed = observed * best_scale(observed, wanted, -3)[:, None, None, None]
@@ -201,12 +242,22 @@ def _scores(
 
 def _headline(rows: list[dict]) -> str:
     light = list(SOURCES.values())[-1]
-    shown = {row["method"]: row for row in rows if row["light"] == light}
-    joint, ideal = shown[f"joint correction for {light}"], shown["ideal complex fields, random phases averaged"]
+    shown = {name: _worst(each) for (name, by), each in _by_method(rows) if by == light}
+    joint, ideal = shown[f"joint correction for {light}"], shown[NAMES["random"]]
     return (
-        f"shown by {light}, the joint correction for it has SSIM {joint['ssim']:.3f} and {joint['psnr']:.1f} dB, ideal "
-        f"complex fields of random phases {ideal['ssim']:.3f} and {ideal['psnr']:.1f} dB"
+        f"shown by {light}, the joint correction for it has at worst SSIM {joint['ssim']:.3f} and {joint['psnr']:.1f} "
+        f"dB, ideal complex fields of random phases {ideal['ssim']:.3f} and {ideal['psnr']:.1f} dB"
     )
+
+
+def _by_method(rows: list[dict]) -> list[tuple[tuple[str, str], list[dict]]]:
+    """Rows of all seeds, by method and light."""
+    chosen = dict.fromkeys((row["method"], row["light"]) for row in rows)
+    return [(key, [row for row in rows if (row["method"], row["light"]) == key]) for key in chosen]
+
+
+def _worst(rows: list[dict]) -> dict[str, float]:
+    return {key: min(row[key] for row in rows) for key in ("ssim", "psnr")}
 
 
 def _setup(eye: Observer, retinas: list[Retina], deviation: float, largest: float, amount: Amount) -> list[str]:
@@ -214,7 +265,8 @@ def _setup(eye: Observer, retinas: list[Retina], deviation: float, largest: floa
     checked = amount.checked
     return [
         f"Teapot{scene}, {amount.size} px of {PITCH}, {amount.frames} frames, eyepiece and eye of "
-        f"configs/eye/teapot.yaml, {len(retinas)} foci; sigma {SIGMA} px, largest phase {largest:.2f} pi",
+        f"configs/eye/teapot.yaml, {len(retinas)} foci; sigma {SIGMA} px, largest phase {largest:.2f} pi; mean (worst) "
+        f"of {len(amount.seeds)} seed(s)",
         f"Wanted: incoherent images in closed form; the mean of {checked} random-phase holograms differs from them by "
         f"{deviation:.3f} (1 / sqrt({checked}) is {checked**-0.5:.3f})",
         f"Predicted error of the collapsed propagation: {max(each.plan.predicted_error for each in retinas):.2f}",
@@ -228,9 +280,11 @@ def _lines(rows: list[dict], cost: list[dict]) -> list[str]:
             f"{each['steps']} steps for {each['light']} in {each['seconds']:.0f} s; at most "
             f"{each['peak_memory_bytes'] / 1e9:.1f} GB of memory so far"
         )
-    for row in rows:
+    for (method, light), each in _by_method(rows):
+        worst, mean = _worst(each), {key: statistics.mean(row[key] for row in each) for key in each[0] if key in _MEANS}
         lines.append(
-            f"{row['method']}; shown: {row['light']}: SSIM {row['ssim']:.3f}, {row['psnr']:.1f} dB, contrast "
-            f"{row['contrast']:.3f}, {row['light_on_retina']:.1%} of the light on the retina"
+            f"{method}; shown: {light}: SSIM {mean['ssim']:.3f} ({worst['ssim']:.3f}), {mean['psnr']:.1f} "
+            f"({worst['psnr']:.1f}) dB, contrast {mean['contrast']:.3f}, {mean['light_on_retina']:.1%} of the light on "
+            "the retina"
         )
     return lines

@@ -22,9 +22,10 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.evaluation import evaluate
 from holotorch.experiments.joint.experiment import JointExperiment, build
-from holotorch.experiments.joint.methods import STEPS_OF_ADAM, Shown, baseline, show
+from holotorch.experiments.joint.methods import Shown, baseline, show
 from holotorch.experiments.joint.names import NAMES
 from holotorch.experiments.joint.views.pupils import APART, TURNED_DEG
+from holotorch.experiments.joint.views.sampled import STEPS_OF_ADAM
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs.figures import figure_png, mark_choice, pareto_front
 from holotorch.io.bundled import find_config

@@ -6,7 +6,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from holotorch.correction import PECProblem
+from holotorch.correction import PECProblem, ProjectedAdam
+
+_LEARNING_RATE = 0.15  # rad, of Adam
+_BETAS = 0.9, 0.99  # of Adam; its square of the gradient follows that of about 100 steps
+_FINAL = 0.01  # learning rate of the last step relative to the first
+STEPS_OF_ADAM = 3  # of some of the views, for each step of L-BFGS with all
 
 
 class Group(NamedTuple):
@@ -46,3 +51,8 @@ class SampledViews:
     def __call__(self, phase: Tensor) -> Tensor:
         """Loss [C] of heater phases [F, C, H, W] in rad."""
         return self._drawn(phase)
+
+
+def adam(steps: int) -> ProjectedAdam:
+    """The solver for views that are drawn at random in each step."""
+    return ProjectedAdam(_LEARNING_RATE, _BETAS, _FINAL, max_steps=steps, tolerance=0.0)
