@@ -125,7 +125,11 @@ def _light_field(setup: _Setup, start: Tensor, seed: int, steps: int) -> Tensor:
     loss = SampledViews(problem, [Group(range(len(setup.foci)), 1)], seed)
     steps *= STEPS_OF_ADAM
     with tqdm(total=steps, desc="chain, light field", unit="step", dynamic_ncols=True) as bar:
-        phase = adam(steps)(loss, start, callback=lambda _: bar.update() and None).x
+
+        def step(_: Solution) -> None:
+            bar.update()
+
+        phase = adam(steps)(loss, start, callback=step).x
     return deconvolve(setup.crosstalk, phase % (2 * math.pi) + math.pi)
 
 
