@@ -324,8 +324,11 @@ def build(settings: PECSettings) -> PECExperiment:
 
 
 def _on_wavelengths(image: Tensor, wavelengths: Sequence[float]) -> Tensor:
-    """What each of K wavelengths shows of a picture [1 or 3, H, W], [K, H, W]; of a single one its luminance."""
-    if len(wavelengths) in (1, 3):
+    """What each of K wavelengths shows of a picture [1 or 3, H, W], [K, H, W]; of a single one its luminance.
+
+    A picture [K, H, W] has a channel for each wavelength, as where a study solves several grey ones at once.
+    """
+    if len(wavelengths) in (1, 3, len(image)):
         return with_channels(image, len(wavelengths))
     return torch.einsum("kc,chw->khw", colour_shares(wavelengths).to(image), with_channels(image, 3))
 

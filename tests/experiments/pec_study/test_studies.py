@@ -3,9 +3,11 @@
 import csv
 import json
 import re
+from pathlib import Path
 
 import pytest
 import torch
+from paths import ROOT
 
 from holotorch.cli import main
 from holotorch.experiments.pec_study import bench as pec_bench
@@ -67,6 +69,7 @@ def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
     assert out.count("(goal 0.01/0.0001: met by APG, growing step, restart; ") == 2
 
 
+@pytest.mark.skipif(not Path(chart_pec.__file__).is_relative_to(ROOT), reason="an installed package has no goals")
 def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
     """Only the chart command compares them; a study has none. The committed ones fit the committed table."""
     row = {"kind": "fresnel", "sigma_px": 1.0, "solver": "L-BFGS", "evaluations_ratio": 3.0, "seconds_ratio": 1.5}
