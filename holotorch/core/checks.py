@@ -130,9 +130,10 @@ def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
 
 def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:
     """Raise ValueError, as :func:`quantity` does, for the first implausible element of ``values``, of any shape."""
-    size = values.detach().abs() if kind.negative else values.detach()
-    if bool(((size >= kind.low) & (size <= kind.high)).all()):
-        return  # the usual case, without a loop over all elements
+    if values.numel() > 1:  # without a loop over all elements
+        size = values.detach().abs() if kind.negative else values.detach()
+        if bool(((size >= kind.low) & (size <= kind.high)).all()):
+            return
     for value in values.detach().reshape(-1).tolist():
         problem = kind.problem(value)
         if problem:

@@ -20,7 +20,7 @@ from holotorch.core.grid import Grid
 from holotorch.optics.free_space.padding import FINEST
 from holotorch.optics.free_space.plane_pair import PlanePair
 
-_REMEMBERED = 1 << 22  # largest number of samples of a remembered factor of the phase; 32 MB
+_REMEMBERED = 1 << 22  # largest number of samples of a remembered factor of the phase; 16 MB in complex64
 _NEAREST = 1.0  # least wavelength times distance, in squared pitches; below it the closed form loses digits
 
 Array = np.ndarray[Any, np.dtype[Any]]
@@ -39,7 +39,8 @@ def has_closed_form(planes: PlanePair, wavelength: Tensor, distance: Tensor) -> 
         return False
     if torch._C._are_functorch_transforms_active() or forward_ad.unpack_dual(distance).tangent is not None:
         return False
-    shortest, longest = wavelength.min().item(), wavelength.max().item()
+    lengths = wavelength.reshape(-1).tolist()  # faster than to ask tensors for the smallest and the largest
+    shortest, longest = min(lengths), max(lengths)
     near = shortest * abs(distance.item()) < _NEAREST * max(planes.grid.pitch) ** 2
     return not near and min(planes.grid.pitch) >= FINEST * longest
 
@@ -77,8 +78,8 @@ class _TimesLearned(torch.autograd.Function):
         quadrants = columns[:, :, :, None] * rows[0, :, None, :]  # of the function and of its derivative
         quadrants[1].addcmul_(columns[0, :, :, None], rows[1, :, None, :])
         if not paraxial:
-            cycles = _cycles_per_metre(padded, tuple(wavelengths.tolist()))
-            quadrants[1].add_(quadrants[0] * cycles.to(quadrants.real.dtype), alpha=2j * math.pi)
+            cycles, slope = _cycles_per_metre(padded, tuple(wavelengths.tolist()), spectrum.dtype)
+            quadrants[1].addcmul_(quadrants[0], slope)
             quadrants *= _phasor(z * cycles, spectrum.dtype)
         ones = [1] * (distance.ndim - wavelength.ndim)
         kernel, slope = quadrants.reshape(2, *ones, *wavelength.shape, *quadrants.shape[-2:])
@@ -144,21 +145,25 @@ def _cycles_phasor(cycles: Array) -> Array:
     return np.exp(2j * math.pi * (cycles - np.round(cycles)))
 
 
-def _cycles_per_metre(padded: Grid, wavelengths: tuple[float, ...]) -> Tensor:
-    """Phase of the factor beyond Fresnel per distance, float64 [C, H // 2 + 1, W // 2 + 1]; remembered if small."""
+def _cycles_per_metre(padded: Grid, wavelengths: tuple[float, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Phase of the factor beyond Fresnel per distance, in float64 cycles, and 2 pi i times it; remembered if small.
+
+    Both have the shape [C, H // 2 + 1, W // 2 + 1].
+    """
     small = len(wavelengths) * math.prod(padded.shape) <= _REMEMBERED
-    return (_remembered_cycles if small else _remembered_cycles.__wrapped__)(padded, wavelengths)
+    return (_remembered_cycles if small else _remembered_cycles.__wrapped__)(padded, wavelengths, dtype)
 
 
 @lru_cache(maxsize=2)
-def _remembered_cycles(padded: Grid, wavelengths: tuple[float, ...]) -> Tensor:
+def _remembered_cycles(padded: Grid, wavelengths: tuple[float, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     wavelength = torch.tensor(wavelengths, dtype=torch.float64)[:, None, None]
     y, x = (
         wavelength * torch.arange(size // 2 + 1, dtype=torch.float64) / (size * pitch)
         for size, pitch in zip(padded.shape, padded.pitch, strict=True)
     )
     sine2 = y.transpose(-1, -2).square() + x.square()
-    return -(sine2 / (1 + torch.sqrt(1 - sine2))).square() / (2 * wavelength)
+    cycles = -(sine2 / (1 + torch.sqrt(1 - sine2))).square() / (2 * wavelength)
+    return cycles, torch.complex(torch.zeros_like(cycles), 2 * math.pi * cycles).to(dtype)
 
 
 def _phasor(cycles: Tensor, dtype: torch.dtype) -> Tensor:
