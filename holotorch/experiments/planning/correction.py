@@ -61,12 +61,12 @@ def _cure(rises: Tensor) -> str:
         return ""
     if bool((rises < 0).any()):
         below = rises[rises < 0]
-        found = f"; rises are negative ({below.min():g} ... {below.max():g})"
+        negative = f"; rises are negative ({below.min():g} ... {below.max():g})"
         if -below.min() > _NOISE * rises.max():
-            return f"{found}: subtract the ambient temperature"
+            return f"{negative}: subtract the ambient temperature"
         return (
-            f"{found}, as noise is: average more measurements, keep only the rows and columns around the heated pixel "
-            "in which the rise is well above the noise, and set what is still below 0 to 0"
+            f"{negative}, as noise is: average more measurements, keep only the rows and columns around the heated "
+            "pixel in which the rise is well above the noise, and set what is still below 0 to 0"
         )
     row, column = divmod(int(rises.argmax()), rises.shape[1])
     down, across = min(row, rises.shape[0] - 1 - row), min(column, rises.shape[1] - 1 - column)

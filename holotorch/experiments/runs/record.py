@@ -89,5 +89,5 @@ def kind_of(folder: Path) -> str:
     """The kind of the run in a folder, complete or not, as its config.yaml says; empty if it does not."""
     config = folder / "config.yaml"
     text = config.read_text(encoding="utf-8", errors="replace") if config.is_file() else ""
-    found = re.search(r"^experiment: *(\w+)", text, re.MULTILINE)
-    return found[1] if found else ""
+    kind = re.search(r"^experiment: *(\w+)", text, re.MULTILINE)
+    return kind[1] if kind else ""

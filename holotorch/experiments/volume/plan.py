@@ -189,8 +189,8 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
 def _beside_the_scene(experiment: VolumeExperiment) -> list[str]:
     """A warning if no plane lies near a depth at which the hologram is refocused."""
     nearest, farthest = min(experiment.depths), max(experiment.depths)
-    reach = max(farthest - nearest, 0.1 * farthest) / 4
-    outside = [depth for depth in experiment.refocus if not nearest - reach <= depth <= farthest + reach]
+    margin = max(farthest - nearest, 0.1 * farthest) / 4
+    outside = [depth for depth in experiment.refocus if not nearest - margin <= depth <= farthest + margin]
     if not outside:
         return []
     return [

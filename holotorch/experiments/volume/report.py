@@ -7,7 +7,7 @@ from holotorch.experiments.runs.page import element, figure, heading, plain, tab
 from holotorch.experiments.runs.record import RunRecord
 
 # What the names of the methods and of the edges of a cone of light mean, for plans and reports.
-METHODS = "axial nodes: a few planes stand for all planes; convolution: the waves of each plane are added by themselves"
+METHODS = "axial nodes: a few planes stand for all planes; convolution: the light of each plane is propagated by itself"
 EDGES = {
     "taper": "each point lights a cone, with a soft edge",
     "band": "each point lights a cone, with a sharp edge in frequency",

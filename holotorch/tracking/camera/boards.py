@@ -123,7 +123,7 @@ def chessboard_size(image: Tensor) -> tuple[int, int] | None:
         image: uint8, grey [H, W] or RGB [3, H, W].
 
     Returns:
-        The size, or None if no chessboard is found.
+        The size, or None without a chessboard.
 
     Raises:
         TypeError, ValueError: ``image`` has another type or shape.
@@ -131,8 +131,8 @@ def chessboard_size(image: Tensor) -> tuple[int, int] | None:
     grey = _grey(image)
     if (scale := _ADVICE_PX / max(grey.shape)) < 1:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    found, _, squares = cv2.findChessboardCornersSBWithMeta(grey, (4, 4), flags=cv2.CALIB_CB_LARGER)
-    if not found:
+    seen, _, squares = cv2.findChessboardCornersSBWithMeta(grey, (4, 4), flags=cv2.CALIB_CB_LARGER)
+    if not seen:
         return None
     rows, columns = squares.shape
     return max(rows, columns), min(rows, columns)

@@ -125,8 +125,8 @@ def test_boards_that_differ_or_that_only_some_photographs_show_get_no_advice(tmp
         with pytest.raises(ConfigError) as caught:
             calibrate_photographs(files, tmp_path / "camera.yaml", words)
         assert "seem to show" not in str(caught.value)
-    found, missing = calibrate_photographs(files, tmp_path / "camera.yaml", ("chessboard", "9x6", "20mm"))
-    assert len(missing) == 1 and "seem to show" not in calibration_text(found, missing)
+    calibration, missing = calibrate_photographs(files, tmp_path / "camera.yaml", ("chessboard", "9x6", "20mm"))
+    assert len(missing) == 1 and "seem to show" not in calibration_text(calibration, missing)
 
 
 def test_folder_without_pictures_is_named(tmp_path):

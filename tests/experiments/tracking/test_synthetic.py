@@ -218,8 +218,8 @@ def test_short_bands_before_a_small_camera_come_nearer_and_are_found(tmp_path, c
     assert largest < 0.2
     given = {"camera": str(files[0]), "catheter": str(files[1])}
     out, _ = track(tmp_path / "run", "synthetic", frames=4, video=False, **given)
-    found = json.loads((out / "summary.json").read_text())
-    assert found["answered"] == 4 and found["truth"]["worst_mm"] < 1
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["answered"] == 4 and summary["truth"]["worst_mm"] < 1
     rows = truths(out / "synthetic")
     assert all(float(row["tip_z_m"]) < 1.1 * largest for row in rows)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Distance")]
