@@ -305,7 +305,7 @@ class JointExperiment:
 
     def kinoform(self, fields: Tensor, crosstalk: ThermalCrosstalk) -> Tensor:
         """Heater phases >= 0 for the phases of ``fields``, deconvolved; pi is added, so that few need cooling."""
-        return deconvolve(crosstalk, fields.angle() % (2 * math.pi) + math.pi)
+        return deconvolved(crosstalk, fields.angle())
 
     def solver(self, crosstalk: ThermalCrosstalk) -> LBFGS:
         """L-BFGS with the preconditioner of the heat kernel, for views that are the same in each step."""
@@ -358,6 +358,14 @@ class JointExperiment:
     def emitted(self, phase: Tensor) -> Tensor:
         """Fields [F, C, H, W] that heater phases of F frames emit."""
         return phasor(self.heat(phase.to(self.device)))
+
+
+def deconvolved(crosstalk: ThermalCrosstalk, phase: Tensor) -> Tensor:
+    """Heater phases >= 0, [..., H, W] in rad, after whose spread the array shows ``phase``, wrapped, plus pi.
+
+    With pi added, few heaters would have to cool, which they cannot.
+    """
+    return deconvolve(crosstalk, phase % (2 * math.pi) + math.pi)
 
 
 def build(settings: JointSettings) -> JointExperiment:

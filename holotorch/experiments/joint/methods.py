@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from holotorch.core.complex import intensity
-from holotorch.correction import deconvolve, gerchberg_saxton, iterative_pec
+from holotorch.correction import gerchberg_saxton, iterative_pec
 from holotorch.correction.problem import best_scale
-from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.joint.experiment import JointExperiment, deconvolved
 from holotorch.experiments.joint.views.sampled import STEPS_OF_ADAM, Group, adam
 from holotorch.experiments.runs.processes import added, process_count
 from holotorch.modulator import ThermalCrosstalk
@@ -61,7 +61,7 @@ def baseline(experiment: JointExperiment, name: str) -> Shown:
 
 def _unheated(experiment: JointExperiment) -> Tensor:
     cold = ThermalCrosstalk(0.0).to(experiment.device)
-    return _corrected(experiment, experiment.optimise(cold, cold, None).x)
+    return deconvolved(experiment.crosstalk, experiment.optimise(cold, cold, None).x)
 
 
 def _light_field(experiment: JointExperiment) -> Tensor:
@@ -72,12 +72,7 @@ def _light_field(experiment: JointExperiment) -> Tensor:
     steps = experiment.settings.steps * (STEPS_OF_ADAM if experiment.settings.eye.per_step is None else 1)
     start = experiment.kinoform(experiment.random_fields(), cold)
     loss = experiment.sampled(cold, views, [group], None)
-    return _corrected(experiment, adam(steps)(loss, start).x)
-
-
-def _corrected(experiment: JointExperiment, phase: Tensor) -> Tensor:
-    """Heater phases for phases that were optimised without heat."""
-    return deconvolve(experiment.crosstalk, phase % (2 * torch.pi) + torch.pi)
+    return deconvolved(experiment.crosstalk, adam(steps)(loss, start).x)
 
 
 def _retrieved(experiment: JointExperiment, corrected: bool) -> Tensor:

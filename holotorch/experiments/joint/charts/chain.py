@@ -15,10 +15,11 @@ from tqdm import tqdm
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import intensity, phasor
 from holotorch.core.fourier import convolve
-from holotorch.correction import LBFGS, PECProblem, Solution, deconvolve, limit_peak_phase, spread_preconditioner
+from holotorch.correction import LBFGS, PECProblem, Solution, limit_peak_phase, spread_preconditioner
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
 from holotorch.experiments.joint.charts.chart import volume_file
+from holotorch.experiments.joint.experiment import deconvolved
 from holotorch.experiments.joint.names import NAMES
 from holotorch.experiments.joint.views.sampled import STEPS_OF_ADAM, Group, SampledViews, adam
 from holotorch.experiments.registry import load_config
@@ -87,7 +88,7 @@ def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[
                 rows.append({"method": name, "light": light, "seed": seed} | numbers)
                 shown.setdefault(f"{name}, shown: {light}", images)
     deviation = _deviation(setup, amount)
-    text = [_headline(rows), *_setup(eye, retinas, deviation, largest, amount), *_lines(rows, cost)]
+    text = [_headline(rows), *_conditions(eye, retinas, deviation, largest, amount), *_lines(rows, cost)]
     peak = wanted.amax()
     pixels = {name: tone_map(each.movedim(1, 0), peak=peak).movedim(0, 1) for name, each in shown.items()}
     short = {name.replace("joint correction ", "joint, "): each for name, each in pixels.items()}
@@ -99,22 +100,21 @@ def _methods(setup: _Setup, seed: int, amount: Amount) -> tuple[dict[str, Tensor
     """Fields [F, C, H, W] that each method emits, the cost of the joint corrections, and their largest phase in pi."""
     generator, crosstalk = torch.Generator().manual_seed(seed), setup.crosstalk
     fields = torch.stack([_random_field(setup.eye, generator) for _ in range(amount.frames)])
-    start = fields.angle() % (2 * math.pi) + math.pi
-    cold = deconvolve(crosstalk, start)
+    kinoform = deconvolved(crosstalk, fields.angle())
     methods, cost, largest = {}, [], 0.0
     for light, operator in ("one wavelength", setup.views), ("SLED", setup.spectral):
-        phase, numbers = _corrected(crosstalk, operator, setup.wanted, cold, light, amount.steps)
+        phase, numbers = _corrected(crosstalk, operator, setup.wanted, kinoform, light, amount.steps)
         cost.append(numbers | {"seed": seed})
         largest = max(largest, crosstalk(phase).max().item() / math.pi)
         methods[f"joint correction for {light}"] = phasor(crosstalk(phase))
-    light_field = limit_peak_phase(LIMIT, _light_field(setup, start, seed, amount.steps), crosstalk)
+    light_field = limit_peak_phase(LIMIT, _light_field(setup, fields, seed, amount.steps), crosstalk)
     methods[NAMES["light_field"]] = phasor(crosstalk(light_field))
-    methods[NAMES["afterwards"]] = phasor(crosstalk(cold))
+    methods[NAMES["afterwards"]] = phasor(crosstalk(kinoform))
     methods[NAMES["random"]] = fields
     return methods, cost, largest
 
 
-def _light_field(setup: _Setup, start: Tensor, seed: int, steps: int) -> Tensor:
+def _light_field(setup: _Setup, fields: Tensor, seed: int, steps: int) -> Tensor:
     """Heater phases [F, C, H, W] by one random focus in each step of Adam without heat, corrected afterwards."""
     unheated = ThermalCrosstalk(0.0)
 
@@ -129,8 +129,8 @@ def _light_field(setup: _Setup, start: Tensor, seed: int, steps: int) -> Tensor:
         def step(_: Solution) -> None:
             bar.update()
 
-        phase = adam(steps)(loss, start, callback=step).x
-    return deconvolve(setup.crosstalk, phase % (2 * math.pi) + math.pi)
+        phase = adam(steps)(loss, deconvolved(unheated, fields.angle()), callback=step).x
+    return deconvolved(setup.crosstalk, phase)
 
 
 def _corrected(
@@ -264,7 +264,7 @@ def _worst(rows: list[dict]) -> dict[str, float]:
     return {key: min(row[key] for row in rows) for key in ("ssim", "psnr")}
 
 
-def _setup(eye: Observer, retinas: list[Retina], deviation: float, largest: float, amount: Amount) -> list[str]:
+def _conditions(eye: Observer, retinas: list[Retina], deviation: float, largest: float, amount: Amount) -> list[str]:
     scene = f" (synthetic: {eye.scene.synthetic})" if eye.scene.synthetic else ""
     checked = amount.checked
     return [
