@@ -253,7 +253,9 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--out", type=Path, help="file to write (default: DIR/report.html; ./report.html for several)")
 
     chart = command("chart", _chart, "speed against accuracy of every method, as a figure and a table")
-    subjects = "camera, chain, eye, joint, network, pec, propagation, retina, scaling, stability, tracking, volume"
+    subjects = (
+        "camera, chain, devices, eye, joint, network, pec, propagation, retina, scaling, stability, tracking, volume"
+    )
     chart.add_argument("subject", help=f"what to chart: {subjects}, or all, on one page")
     chart.add_argument("--quick", action="store_true", help="a reduced form, which takes seconds and tests no goal")
     places = "scripts/charts/SUBJECT, with --quick runs/charts-quick/SUBJECT; of all: without SUBJECT"

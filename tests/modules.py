@@ -1,7 +1,7 @@
 """One list of small public modules and what they learn. A new module brings a constructor; contracts are shared."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -69,6 +69,15 @@ class Example:
     without: dict[str, str] = field(default_factory=dict)
     batched: bool = True
     rounded: bool = False
+
+    def on(self, device: str) -> "Example":
+        """The same module and inputs on another device."""
+        return replace(
+            self,
+            name=f"{self.name}, {device}",
+            build=lambda: self.build().to(device),
+            inputs=lambda: tuple(value.to(device) for value in self.inputs()),
+        )
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:

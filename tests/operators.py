@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -60,6 +60,7 @@ class Case:
             phase k z of up to 2.4e4 rad, 2.4e4 * 1e-16, with a margin.
         unitary: Whether the adjoint is the inverse.
         refusal: Message for an input whose last axis is one sample short; None for operators that take any size.
+        device: Device of the operator and of its inputs.
     """
 
     name: str
@@ -72,6 +73,12 @@ class Case:
     tolerance: float = 1e-11
     unitary: bool = False
     refusal: str | None = r"field must end in \(C, H, W\) = \(2, 12, 17\), got \(2, 12, 16\)"
+    device: str = "cpu"
+
+    def on(self, device: str) -> "Case":
+        """The same operator on another device."""
+        build = lambda: self.build().to(device)  # noqa: E731
+        return replace(self, name=f"{self.name}, {device}", build=build, device=device)
 
     def input(self, *batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
         """Gaussian noise of the input's shape; ``dtype`` is that of the real part."""
@@ -82,8 +89,8 @@ class Case:
         return self._noise((*batch, *self.channels, *self.out_shape), dtype)
 
     def _noise(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        real = torch.randn(shape, dtype=dtype)
-        return real if self.real else torch.complex(real, torch.randn(shape, dtype=dtype))
+        real = torch.randn(shape, dtype=dtype, device=self.device)
+        return real if self.real else torch.complex(real, torch.randn_like(real))
 
 
 _VIEWS = (

@@ -23,7 +23,7 @@ ROOMS = {
         {"camera"},
     ],
     "experiments": [
-        {"measure", "view"},
+        {"measure", "view", "devices"},
         {"panel", "sweep", "pec_study", "scaling", "stability", "tracking_benchmark", "streaming"},
         {"joint"},
         {"eye"},

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from operators import CASES, GRID, SHALLOW, WAVELENGTHS, Case
+from paths import DEVICES
 
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel
@@ -17,9 +18,12 @@ pytestmark = pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingW
 EXACT = 1e-12
 
 
+EVERYWHERE = [*CASES, *(case.on(device) for case in CASES for device in DEVICES[1:])]
+
+
 def every_operator():
-    """All cases."""
-    return pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+    """All cases, on every device that the machine has."""
+    return pytest.mark.parametrize("case", EVERYWHERE, ids=[case.name for case in EVERYWHERE])
 
 
 def relative(got: torch.Tensor, wanted: torch.Tensor) -> float:
@@ -39,12 +43,13 @@ def test_adjoint_is_the_conjugate_transpose(case: Case):
 def test_equals_a_dense_matrix(case: Case):
     x, y = case.input(), case.output()
     channels = math.prod(case.channels)
-    out, back = (got.reshape(channels, -1).numpy() for got in (case.build()(x), case.build().adjoint(y)))
+    results = case.build()(x), case.build().adjoint(y)
+    out, back, x, y = (each.cpu().reshape(channels, -1).numpy() for each in (*results, x, y))
     for c in range(channels):
         matrix = case.matrix(c)
-        wanted = matrix @ x.reshape(channels, -1)[c].numpy()
+        wanted = matrix @ x[c]
         np.testing.assert_allclose(out[c], wanted, rtol=0, atol=case.tolerance * np.abs(wanted).max())
-        wanted = matrix.conj().T @ y.reshape(channels, -1)[c].numpy()
+        wanted = matrix.conj().T @ y[c]
         np.testing.assert_allclose(back[c], wanted, rtol=0, atol=case.tolerance * np.abs(wanted).max())
 
 
@@ -91,18 +96,26 @@ def test_casting_the_module_keeps_the_kernel_whole(case: Case):
         lambda m: m.double(),
         lambda m: m.float(),
         lambda m: m.half().double(),
-        lambda m: m.to("cpu", torch.bfloat16),
+        lambda m: m.to(case.device, torch.bfloat16),
     ):
         assert torch.equal(cast(case.build())(x), wanted)
 
 
-@every_operator()
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.skipif(not DEVICES[1:], reason="no CUDA device")
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 def test_device_follows_the_module(case: Case):
-    x = case.input()
-    out = case.build().to("cuda")(x.cuda())
-    assert out.device.type == "cuda"
-    assert relative(out.cpu(), case.build()(x)) <= EXACT
+    x, y = case.input(), case.output()
+    for device in DEVICES[1:]:
+        operator = case.build().to(device)
+        for apply, value, wanted in (
+            (operator, x, case.build()(x)),
+            (operator.adjoint, y, case.build().adjoint(y)),
+        ):
+            exact = apply(value.to(device))
+            single = apply(value.to(device, torch.float32 if case.real else torch.complex64))
+            assert exact.device.type == single.device.type == device
+            assert relative(exact.cpu(), wanted) <= EXACT
+            assert relative(single.cpu().to(wanted.dtype), wanted) <= 2e-6
 
 
 @every_operator()
@@ -124,7 +137,9 @@ SAME_GRAPH = {
     "pixel shape, two orders",
 }
 # The box of ConvolutionHologram is compiled in tests/test_every_module.py.
-COMPILED = [case for case in CASES if case.name not in SAME_GRAPH and not re.match("Direct|Convolution", case.name)]
+COMPILED = [
+    case for case in EVERYWHERE if case.name not in SAME_GRAPH and not re.match("Direct|Convolution", case.name)
+]
 
 
 @pytest.mark.parametrize("case", [*COMPILED, *SHALLOW], ids=lambda case: case.name)
@@ -139,7 +154,7 @@ def test_compiles_without_graph_breaks(case: Case):
     assert relative(got, wanted) <= EXACT
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case.unitary], ids=lambda case: case.name)
+@pytest.mark.parametrize("case", [case for case in EVERYWHERE if case.unitary], ids=lambda case: case.name)
 def test_unitary_operators_keep_power_and_are_undone_by_their_adjoint(case: Case):
     operator, x = case.build(), case.input()
     assert abs(operator(x).norm() / x.norm() - 1) <= EXACT

@@ -1,5 +1,6 @@
-"""Protection of numbers against half precision, whose rounding would change a phase."""
+"""Numbers in the precision that a phase needs: protection against half precision, and lengths in float64."""
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
@@ -12,6 +13,11 @@ def at_least_single(values: Tensor) -> Tensor:
     float16 cannot represent values below 6e-8 or above 65504, nor every integer above 2048 (bfloat16: above 256).
     """
     return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
+
+
+def double(value: Tensor | float | Sequence[float], device: torch.device) -> Tensor:
+    """``value`` in float64 on ``device``. The processor does not wait for a GPU to receive it."""
+    return torch.as_tensor(value, dtype=torch.float64).to(device, non_blocking=True)
 
 
 def without_autocast(values: Tensor) -> AbstractContextManager[object]:

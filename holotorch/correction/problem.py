@@ -101,6 +101,7 @@ class PECProblem(nn.Module):
         if limit is not None:
             fixed("limit", limit, "it is constant; give limit.detach()")
             limit = torch.as_tensor(limit, dtype=torch.float64).reshape(-1, 1, 1)
+            limit = limit if target is None else limit.to(target.device)
             if not (limit > 0).all():
                 raise ValueError("limit must be above zero in rad")
             checks.all_finite("limit", limit)

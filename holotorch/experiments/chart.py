@@ -17,6 +17,7 @@ CHARTS = {
     "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
     "retina": ("holotorch.experiments.eye.retina_chart", ""),
     "scaling": ("holotorch.experiments.scaling.chart", ""),
+    "devices": ("holotorch.experiments.devices.chart", ""),
     "camera": ("holotorch.experiments.camera.chart", "corrected"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
     "network": ("holotorch.experiments.network.chart", "training"),

@@ -301,7 +301,9 @@ class Accumulator:
             # Rows of the block hold real and imaginary parts of the nodes alternately, since the planes are real.
             spread = torch.view_as_real(spread).movedim(-1, 1).flatten(0, 1)
         # One product per image row: for a single large product torch would first copy the planes into another order.
-        self.block.baddbmm_(spread.to(self.block).expand(height, -1, -1), planes.to(self.block.dtype))
+        self.block.baddbmm_(
+            spread.to(self.block, non_blocking=True).expand(height, -1, -1), planes.to(self.block.dtype)
+        )
 
     def _close(self, nodes: set[int]) -> None:
         """Add ``nodes``, to which no later plane contributes, to the total, and clear their rows of the block."""

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.precision import double
 from holotorch.core.quantities import DEPTH
 from holotorch.optics.free_space.geometry import lateral_spread
 from holotorch.optics.free_space.kernels import cycles_phasor
@@ -81,7 +82,7 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     """
     square = dy.square() + dx.square()
     distance = torch.sqrt(depth**2 + square)
-    carrier = cycles_phasor(torch.tensor(depth / wavelength, dtype=torch.float64, device=dy.device))
+    carrier = cycles_phasor(double(depth / wavelength, dy.device))
     wave = cycles_phasor(square / (distance + depth) / wavelength) * (carrier / distance)
     if cone == "full":
         return wave

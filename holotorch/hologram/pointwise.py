@@ -94,7 +94,7 @@ class DirectHologram(LayerHologram):
         count, last = (len(columns) - 1) * stride + pixels, self._positions(width, 1)[columns[-1]]
         index = (torch.arange(count, device=device) - last).abs()
         wave_row = self._wave_rows(depth, farthest, max(abs(last), abs(count - 1 - last)), device)
-        rows = torch.tensor(positions, device=device)
+        rows = torch.tensor(positions).to(device, non_blocking=True)
         for offset in range(farthest + 1):
             wave = wave_row(offset)[index]
             if has_light(wave):

@@ -48,9 +48,11 @@ def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
         raise ValueError(f"ssim needs images of at least {least}, got {height} x {width}; psnr has no such limit")
     if not image.numel():  # an empty batch has an empty map
         return image[..., SSIM_WINDOW - 1 :, SSIM_WINDOW - 1 :]
-    images, references = (tensor.reshape(-1, 1, height, width) for tensor in (image, reference))
+    # A GPU would round the products of float32 convolutions to 11 bits (TF32).
+    exact = torch.float64 if image.is_cuda else image.dtype
+    images, references = (tensor.reshape(-1, 1, height, width).to(exact) for tensor in (image, reference))
     scores = kornia_ssim(images, references, SSIM_WINDOW, float(data_range), eps=0.0, padding="valid")
-    return scores.reshape(*image.shape[:-2], *scores.shape[-2:])
+    return scores.reshape(*image.shape[:-2], *scores.shape[-2:]).to(image.dtype)
 
 
 class PerceptualSimilarity(nn.Module):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.precision import double
 from holotorch.core.quantities import CAUCHY_B, WAVELENGTH
 
 Birefringence = Callable[[Tensor], Tensor]
@@ -77,8 +78,8 @@ class BirefringenceTable:
                 f"wavelengths {lengths.min().item() * 1e9:.6g} to {lengths.max().item() * 1e9:.6g} nm lie outside the "
                 f"birefringence table, {low * 1e9:.6g} to {high * 1e9:.6g} nm; measure there, or fit it by fit_cauchy"
             )
-        nodes = torch.tensor(self.wavelengths, dtype=torch.float64, device=lengths.device).square().reciprocal()
-        values = torch.tensor(self.values, dtype=torch.float64, device=lengths.device)
+        nodes = double(self.wavelengths, lengths.device).square().reciprocal()
+        values = double(self.values, lengths.device)
         x = lengths.square().reciprocal()
         row = torch.bucketize(-x.detach(), -nodes).clamp(1, len(nodes) - 1)  # the signs make the nodes increase
         part = (x - nodes[row - 1]) / (nodes[row] - nodes[row - 1])

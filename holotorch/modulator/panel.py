@@ -11,7 +11,7 @@ from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
 from holotorch.core.learning import PreciseModule, without_graph
-from holotorch.core.precision import at_least_single
+from holotorch.core.precision import at_least_single, double
 from holotorch.core.quantities import WAVELENGTH
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 from holotorch.modulator.dispersion import Birefringence, phase_scale
@@ -171,7 +171,7 @@ class PhaseModulator(PreciseModule):
             lit = torch.as_tensor(light, dtype=torch.float64)
             checks.quantities(WAVELENGTH, lit, "light")
             if self.birefringence is not None:
-                design = torch.tensor(self.wavelengths, dtype=torch.float64, device=lit.device)
+                design = double(self.wavelengths, lit.device)
                 scale = phase_scale(lit, design, self.birefringence)
                 shown = shown * scale.to(shown.device, shown.dtype)[..., None, None]
         field = phasor(shown)

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.complex import phasor
+from holotorch.core.precision import double
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 
 # The thesis's phase shifter shifts light of 630 nm by pi at 175 K above ambient.
@@ -68,4 +68,4 @@ class PhasedArray(nn.Module):
 
     def _response_like(self, value: Tensor) -> Tensor:
         self._check(value)
-        return torch.tensor(self.response, dtype=value.dtype, device=value.device)[:, None, None]
+        return double(self.response, value.device).to(value.dtype)[:, None, None]

@@ -133,8 +133,8 @@ def test_the_front_holds_what_no_other_point_beats():
 def test_unknown_subject(tmp_path, capsys):
     assert main(["chart", "propagatoin", "--out", str(tmp_path)]) == 2
     assert (
-        "no chart of 'propagatoin'; known: camera, chain, eye, joint, network, pec, propagation, retina, scaling, "
-        "stability, tracking, volume" in capsys.readouterr().err
+        "no chart of 'propagatoin'; known: camera, chain, devices, eye, joint, network, pec, propagation, retina, "
+        "scaling, stability, tracking, volume" in capsys.readouterr().err
     )
 
 

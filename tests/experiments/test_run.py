@@ -62,7 +62,7 @@ def test_folder_holds_what_is_promised_and_nothing_else(finished):
     assert set(rows[0]) == {"step", "evaluations", "seconds", "ssim_mean", "loss_630nm", "loss_530nm", "loss_445nm"}
     assert float(rows[9]["ssim_mean"]) > 0 and rows[8]["ssim_mean"] == ""
     env = read(finished, "env.json")
-    assert env["seed"] == 7 and env["packages"]["torch"] == torch.__version__
+    assert env["seed"] == 7 and torch.__version__.startswith(env["packages"]["torch"])
     assert load_image(finished / "images" / "corrected.png").shape == (3, 32, 24)
 
 
@@ -240,7 +240,7 @@ def test_a_run_that_fails_before_anything_is_computed_leaves_no_folder(tmp_path,
 
 
 def test_a_solver_that_cannot_start_is_the_users_to_mend(tmp_path, monkeypatch):
-    monkeypatch.setattr(PECExperiment, "start_phase", lambda self: torch.zeros(self.target.shape))
+    monkeypatch.setattr(PECExperiment, "start_phase", lambda self: torch.zeros_like(self.target, device=self.device))
     with pytest.raises(ConfigError, match="the solver cannot start: the gradient vanishes"):
         execute(settings(), tmp_path / "a")
     assert not (tmp_path / "a").exists()

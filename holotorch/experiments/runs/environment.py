@@ -22,20 +22,24 @@ _PACKAGES = ("torch", "numpy", "kornia", "scikit-image", "opencv-contrib-python-
 
 def environment(seed: int, device: torch.device) -> dict[str, Any]:
     """Contents of env.json, as plain JSON values."""
-    import torch
-
-    cpu = f"CPU, {torch.get_num_threads()} threads"
     return {
         "holotorch": holotorch.__version__,
         "git": _git_state(Path(holotorch.__file__).parents[1]),
         "python": platform.python_version(),
         "packages": {name: installed_version(name) for name in _PACKAGES},
         "platform": platform.platform(),
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu,
+        "device": device_name(device),
         "seed": seed,
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": ["holotorch", *sys.argv[1:]],
     }
+
+
+def device_name(device: torch.device) -> str:
+    """Name of a GPU, or the number of threads on the processor."""
+    import torch
+
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
 
 
 def installed_version(name: str) -> str | None:

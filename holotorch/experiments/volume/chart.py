@@ -58,6 +58,7 @@ class Scene:
     side: int  # pixels along each side of the hologram
     distance: float  # of the ball's centre from the hologram, in metres
     planes: int
+    device: torch.device = torch.device("cpu")
 
     @property
     def grid(self) -> Grid:
@@ -74,14 +75,14 @@ class Scene:
     def phase(self) -> Tensor:
         """Random phase of each ray, float32 [r, r] for r rays along each side."""
         generator = torch.Generator().manual_seed(1)
-        return 2 * math.pi * torch.rand(self.side // 2, self.side // 2, generator=generator)
+        return 2 * math.pi * torch.rand(self.side // 2, self.side // 2, generator=generator).to(self.device)
 
     def amplitudes(self) -> Iterator[Tensor]:
         """Amplitudes of each plane in turn, real [r, r]; the noise repeats after eight planes."""
         rays = self.side // 2
         generator = torch.Generator().manual_seed(2)
-        noise = torch.rand(8, rays, rays, generator=generator)
-        position = (torch.arange(rays) - rays // 2) / (rays / 2)
+        noise = torch.rand(8, rays, rays, generator=generator).to(self.device)
+        position = (torch.arange(rays, device=self.device) - rays // 2) / (rays / 2)
         square = position[:, None].square() + position.square()
         for j in range(self.planes):
             inside = square <= 1 - (2 * (j + 0.5) / self.planes - 1) ** 2
@@ -109,16 +110,18 @@ class ThesisConvolution:
         self.ready = self._wave(scene.depths[0]) if ready else None
 
     def _wave(self, depth: float) -> Tensor:
-        position = torch.fft.fftfreq(self.length, 1 / self.length, dtype=torch.float64) * PITCH
+        spacing, device = 1 / self.length, self.scene.device
+        position = torch.fft.fftfreq(self.length, spacing, dtype=torch.float64, device=device) * PITCH
         wave = spherical_wave(position[:, None], position[None], (PITCH, PITCH), self.wavelength, depth, "box")
         return fft2(wave.to(torch.complex64))
 
     def __call__(self, planes: int | None = None) -> Tensor:
         """The hologram of the first ``planes`` planes; of all planes by default."""
         side, phase = self.scene.side, self.scene.phase
-        total, phasor = torch.zeros(side, side, dtype=torch.complex64), torch.polar(torch.ones_like(phase), phase)
+        phasor = torch.polar(torch.ones_like(phase), phase)
+        total = torch.zeros(side, side, dtype=torch.complex64, device=phase.device)
         for j, amplitude in enumerate(islice(self.scene.amplitudes(), planes)):
-            spread = torch.zeros(self.length, self.length, dtype=torch.complex64)
+            spread = total.new_zeros(self.length, self.length)
             spread[:side:2, :side:2] = amplitude * phasor
             wave = self._wave(self.scene.depths[j]) if self.ready is None else self.ready
             total += ifft2(fft2(spread) * wave, (side, side))

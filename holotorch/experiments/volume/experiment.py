@@ -4,7 +4,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -304,7 +304,9 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     volume, synthetic = open_volume(settings.volume)
     try:
         volume.check_finite()
-        experiment = VolumeExperiment(settings, volume, synthetic, find_device(settings.device))
+        device = find_device(settings.device)
+        volume = replace(volume, values=volume.values.to(device))
+        experiment = VolumeExperiment(settings, volume, synthetic, device)
         _ = experiment.transfer  # read now, so that its errors are reported
     except ValueError as error:
         raise ConfigError([f"volume: {error}"]) from error

@@ -67,7 +67,7 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
 def fingerprint_inputs(experiment: VolumeExperiment) -> tuple[VolumeSettings, dict[str, tuple[Any, ...]], set[str]]:
     """Settings, inputs and free keys for :func:`fingerprint`; a resumed run may change seeds and device."""
     volume, file = experiment.volume, experiment.settings.transfer.file
-    inputs: dict[str, tuple[Any, ...]] = {"volume": (volume.values, repr((volume.spacing, volume.unit)))}
+    inputs: dict[str, tuple[Any, ...]] = {"volume": (volume.values.cpu(), repr((volume.spacing, volume.unit)))}
     if file:
         inputs["transfer.file"] = (Path(file).read_bytes(),)
     return experiment.settings, inputs, {"device", "report.seeds"}

@@ -11,6 +11,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import filter_spectrum, good_length
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import FieldOperator, Wavelengths
+from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE, FOCAL_LENGTH, WAVELENGTH
 from holotorch.optics.elements.lens_response import lens_matrices
 from holotorch.optics.free_space.impulse_response import fresnel_taps, tap_indices
@@ -60,9 +61,7 @@ def converging_fresnel(
             checks.quantities(kind, value, name)
     offset = checks.offset(offset)
     checks.precise(wavelength, distance)
-    wavelength, distance, focus = (
-        torch.as_tensor(value, dtype=torch.float64, device=field.device) for value in (wavelength, distance, focus)
-    )
+    wavelength, distance, focus = (double(value, field.device) for value in (wavelength, distance, focus))
     if not torch.compiler.is_compiling() and (distance == 0).any():
         raise ValueError("distance must be other than zero in metres")
     columns, rows = lens_matrices(grid, wavelength, distance, focus, out_grid, offset)

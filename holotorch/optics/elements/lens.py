@@ -12,6 +12,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
 from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
+from holotorch.core.precision import double
 from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, SOFTNESS, WAVELENGTH
 from holotorch.optics.free_space.kernels import cycles_phasor
 
@@ -174,9 +175,13 @@ class Lens(Transmission):
     def computed(self) -> Tensor:
         """Transmission for the present focal length, complex128 [C, H, W]."""
         length = torch.as_tensor(self.focal_length, dtype=torch.float64)
-        wavelength = torch.tensor(self.wavelengths, dtype=torch.float64, device=length.device)
+        wavelength = double(self.wavelengths, length.device)
         values = cycles_phasor(_phase_cycles(self.grid, wavelength, length, self.paraxial))
-        return values if self.radius is None else values * pupil(self.grid, self.radius).to(length.device)
+        return (
+            values
+            if self.radius is None
+            else values * pupil(self.grid, self.radius).to(length.device, non_blocking=True)
+        )
 
     def extra_repr(self) -> str:
         """Sampling, wavelengths and lens, for ``print(module)``."""
@@ -249,10 +254,9 @@ def affordable(what: str, grid: Grid, channels: int) -> None:
 
 def _phase_cycles(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, paraxial: bool) -> Tensor:
     """:func:`lens_phase` in cycles."""
-    device = next((v.device for v in (focal_length, wavelength) if isinstance(v, Tensor)), None)
-    wavelength_values, length = (
-        torch.as_tensor(v, dtype=torch.float64, device=device)[..., None, None] for v in (wavelength, focal_length)
-    )
+    given = [v.device for v in (focal_length, wavelength) if isinstance(v, Tensor)]
+    device = given[0] if given else torch.device("cpu")
+    wavelength_values, length = (double(v, device)[..., None, None] for v in (wavelength, focal_length))
     y, x = grid.coordinates(length.device)
     square = y.square() + x.square()
     if paraxial:

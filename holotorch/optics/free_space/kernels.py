@@ -11,7 +11,8 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid, Pair
-from holotorch.core.quantities import DISTANCE, WAVELENGTH, Quantity
+from holotorch.core.precision import double
+from holotorch.core.quantities import DISTANCE, WAVELENGTH
 
 
 def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
@@ -20,7 +21,8 @@ def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
     k z exceeds 1e6 rad, where float32 numbers are 0.1 rad apart, so whole cycles are subtracted in float64. Emits a
     PrecisionWarning if the rounding of a float32 argument changes the phase by 0.01 rad or more.
     """
-    cycles = _float64(DISTANCE, distance) / _float64(WAVELENGTH, wavelength)
+    wavelengths, distances = _lengths(wavelength, distance)
+    cycles = distances / wavelengths
     checks.precise(wavelength, distance)
     return cycles_phasor(cycles)
 
@@ -45,8 +47,7 @@ def angular_spectrum_kernel(
     k_z - k is computed as -k s^2 / (1 + cos), with the sine s and cosine of the angle, to avoid cancellation.
     Source: Goodman, Sec. 3.10.
     """
-    wavelength, distance = _float64(WAVELENGTH, wavelength), _float64(DISTANCE, distance)
-    wavelength, distance = wavelength[..., None, None], distance[..., None, None]
+    wavelength, distance = (length[..., None, None] for length in _lengths(wavelength, distance))
     fy, fx = grid.frequencies(distance.device)
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     cosine, imaginary = direction_cosine(sine2)
@@ -78,7 +79,8 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     The arguments are those of :func:`angular_spectrum_kernel`. The phase differs from the exact one by about
     k z (wavelength f)^4 / 8. Source: thesis Eq. 4.49; Goodman, Sec. 4.2.
     """
-    product = (_float64(WAVELENGTH, wavelength) * _float64(DISTANCE, distance))[..., None, None]
+    wavelength, distance = _lengths(wavelength, distance)
+    product = (wavelength * distance)[..., None, None]
     fy, fx = grid.frequencies(product.device)
     return cycles_phasor(-product / 2 * fy.square()) * cycles_phasor(-product / 2 * fx.square())
 
@@ -123,6 +125,10 @@ def cycles_phasor(cycles: Tensor) -> Tensor:
     return phasor(2 * math.pi * (cycles - cycles.detach().round()))
 
 
-def _float64(kind: Quantity, value: Tensor | float) -> Tensor:
-    checks.plausible(kind, value)
-    return torch.as_tensor(value, dtype=torch.float64)
+def _lengths(wavelength: Tensor | float, distance: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Both lengths in float64 on the device of the one that is elsewhere than on the processor, if one is."""
+    checks.plausible(WAVELENGTH, wavelength)
+    checks.plausible(DISTANCE, distance)
+    given = [value.device for value in (wavelength, distance) if isinstance(value, Tensor)]
+    device = next((device for device in given if device.type != "cpu"), torch.device("cpu"))
+    return double(wavelength, device), double(distance, device)

@@ -14,6 +14,7 @@ from holotorch.core.fourier import centred_fft2, centred_ifft2, fft2, filter_spe
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
+from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.geometry import least_padding
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
@@ -122,7 +123,7 @@ class DistanceFilter(SpectralFilter):
         return self._transfer_function(*self._lengths(), dtype)
 
     def _lengths(self) -> tuple[Tensor, Tensor]:
-        distance = torch.as_tensor(self.distance, dtype=torch.float64, device=self.wavelength.device)
+        distance = double(self.distance, self.wavelength.device)
         return self.wavelength.reshape(-1), distance
 
     def _forward(self, field: Tensor) -> Tensor:

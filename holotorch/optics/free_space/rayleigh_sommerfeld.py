@@ -11,6 +11,7 @@ from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import FieldOperator, Wavelengths
+from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.kernels import cycles_phasor
 
@@ -78,7 +79,7 @@ class RayleighSommerfeld(FieldOperator):
         y, x = self.grid.coordinates(device)
         rows, columns = self.out_grid.coordinates(device)
         points = torch.cartesian_prod(rows[:, 0] + self.offset[0], columns[0] + self.offset[1])
-        wavelengths = torch.tensor(self.wavelengths, dtype=torch.float64, device=device)[:, None, None]
+        wavelengths = double(self.wavelengths, device)[:, None, None]
         area, z = math.prod(self.grid.pitch), abs(self.distance)
         for chunk in points.split(max(1, _CHUNK // math.prod(self.grid.shape) // len(self.wavelengths))):
             dy, dx = chunk[:, 0, None, None] - y, chunk[:, 1, None, None] - x

@@ -10,6 +10,7 @@ from holotorch.core import checks
 from holotorch.core.fourier import fft2, ifft2, multiplied
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import FieldOperator, Wavelengths
+from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.impulse_response import fresnel_taps, levelling_shift, remainder_kernel, tilted_cycles
 from holotorch.optics.free_space.kernels import carrier, cycles_phasor
@@ -45,7 +46,7 @@ def resampling_factors(
     """
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     if tilt is None:
-        tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
+        tilt = double(planes.tilt, distance.device)
     cosine2 = 1 - tilt.square().sum()
     nyquist = 0.5 / planes.grid.pitch[0], 0.5 / planes.grid.pitch[1]
     # Shifts in metres: the linear phases that are moved from the factor beyond Fresnel into the taps.

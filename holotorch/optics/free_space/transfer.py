@@ -10,6 +10,7 @@ from torch import Tensor
 
 from holotorch.core.fourier import multiplied, multiply_even
 from holotorch.core.grid import Grid
+from holotorch.core.precision import double
 from holotorch.optics.free_space.impulse_response import (
     fresnel_taps,
     levelling_shift,
@@ -52,7 +53,7 @@ def transfer_function(
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     tilted = any(planes.tilt)
     if tilt is None:
-        tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
+        tilt = double(planes.tilt, distance.device)
     positions = shifts(planes, distance, tilt)
     cosine2 = 1 - tilt.square().sum()
     carrier_factor = carrier(wavelength, distance * torch.sqrt(cosine2)).to(dtype)
@@ -144,7 +145,7 @@ def _axis_factor(
         frequency = torch.fft.fftfreq(size, pitch, dtype=torch.float64, device=distance.device)
         cycles = -(wavelength * distance)[..., None] / 2 * frequency.square()
         return cycles_phasor(cycles + frequency * pitch * position[..., None])
-    index = tap_indices(size, planes.grid.shape[axis], planes.out.shape[axis]).to(distance.device)
+    index = tap_indices(size, planes.grid.shape[axis], planes.out.shape[axis]).to(distance.device, non_blocking=True)
     positions = index + position[..., None]
     at_zero = (distance == 0)[..., None]
     taps = fresnel_taps(positions, pitch, wavelength, torch.where(distance == 0, pitch, distance))

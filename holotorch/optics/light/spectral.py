@@ -25,6 +25,7 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity
 from holotorch.core.fourier import centred_fft2, centred_ifft2
 from holotorch.core.grid import Grid
+from holotorch.core.precision import double
 from holotorch.optics.free_space.kernels import cycles_phasor
 from holotorch.optics.light.incoherent import incoherent_sum
 from holotorch.optics.light.wavelength_sampling import error_free, least_count, pupil_exceeds_band, select_wavelengths
@@ -76,7 +77,7 @@ def neighbours(
     fy, fx = (torch.fft.fftshift(frequencies) for frequencies in grid.frequencies(image.device))
 
     def parabola(values: Tensor, rate, rows: Tensor, columns: Tensor) -> Tensor:
-        rate = torch.as_tensor(rate, dtype=torch.float64, device=values.device)
+        rate = double(rate, values.device)
         by_row, by_column = cycles_phasor(rate * rows.square()), cycles_phasor(rate * columns.square())
         return values * by_row.to(values.dtype) * by_column.to(values.dtype)
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.learning import without_graph
+from holotorch.core.precision import double
 from holotorch.core.quantities import ACCOMMODATION, EYE_LENGTH, PUPIL_RADIUS, SOFTNESS, WAVEFRONT_ERROR
 from holotorch.optics.elements.lens import Transmission, affordable, lens_phase, opening, warn_if_coarse
 from holotorch.optics.free_space.kernels import cycles_phasor
@@ -71,13 +72,13 @@ class Eye:
         ``y`` and ``x`` are positions on the plane of the pupil, float64, and broadcast; all lengths in metres.
         """
         square = y.square() + x.square()
-        radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
+        radius = double(self.pupil_radius, square.device)
         return opening(square, radius, self.softness) * cycles_phasor(self.path(y, x, wavelength) / wavelength)
 
     def path(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
         """Path in metres, float64, that all aberrations add; arguments as in :meth:`pupil_function`."""
         square = y.square() + x.square()
-        radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
+        radius = double(self.pupil_radius, square.device)
         path = torch.zeros_like(square)
         for index, coefficient in self.aberrations.items():
             path = path + coefficient * zernike(index, y / radius, x / radius)

@@ -37,6 +37,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.deprecation import renamed
 from holotorch.core.fourier import centred_fft2, centred_ifft2, fft2, good_length, ifft2, multiplied
 from holotorch.core.grid import Grid
+from holotorch.core.precision import double
 from holotorch.optics.free_space.kernels import (
     angular_spectrum_kernel,
     carrier,
@@ -276,22 +277,24 @@ def _factors(
     paraxial: bool,
 ) -> CollapseFactors:
     """:func:`collapse_factors` for one wavelength."""
-    device, dtype = like.device, like.dtype
+    device, dtype, there = like.device, like.dtype, double(plane, like.device)
     first, second, _, back = display.matrix(plane)
     padded, window, fine = Grid(sizes.padded, grid.pitch), Grid(sizes.window, grid.pitch), _fine(grid, sizes)
     if paraxial:
-        kernel = fresnel_kernel(padded, wavelength, plane)
+        kernel = fresnel_kernel(padded, wavelength, there)
     else:
         # Propagate exactly to the eyepiece, then back to the plane by Fresnel, because the ray matrix is paraxial.
-        kernel = angular_spectrum_kernel(padded, wavelength, display.lens_distance, band_limit=False)
-        kernel = kernel * fresnel_kernel(padded, wavelength, display.lens_distance - plane).conj()
+        lens = double(display.lens_distance, device)
+        kernel = angular_spectrum_kernel(padded, wavelength, lens, band_limit=False)
+        kernel = kernel * fresnel_kernel(padded, wavelength, lens - there).conj()
     if all(p >= n + w or n == 1 for p, n, w in zip(sizes.padded, grid.shape, sizes.window, strict=True)):
         half_y, half_x = ((n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True))
-        kernel = kernel * window_taper(padded, wavelength, number(plane), (half_y, half_x), paraxial=paraxial)
-    kernel = (kernel * carrier(wavelength, plane)).to(device, dtype)
+        taper = window_taper(padded, wavelength, number(plane), (half_y, half_x), paraxial=paraxial)
+        kernel = kernel * taper.to(device)
+    kernel = (kernel * carrier(wavelength, there)).to(dtype)
     chirp_factors = [] if sizes.plain else chirps(grid, padded, fine, (0.0, 0.0), device)
     zoom = [(a.to(dtype), b.to(dtype), c.to(dtype)) for a, b, c in chirp_factors]
-    rate = torch.as_tensor(first / second, dtype=torch.float64, device=device) / (2 * wavelength)
+    rate = double(first / second, device) / (2 * wavelength)
     curvature = [cycles_phasor(rate * coordinate.square()).to(dtype) for coordinate in fine.coordinates(device)]
     bands = pupil_bands(grid, wavelength, display, eye, plane)
     # The positions (eta, xi) on the pupil of the frequencies of the spectrum. The window has the same width at both

@@ -13,6 +13,7 @@ from holotorch.core.fourier import fft2, good_length, ifft2
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.learning import PreciseModule
 from holotorch.core.operator import Wavelengths
+from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel
 
@@ -94,7 +95,7 @@ class PupilViews(PreciseModule):
 
     def _kernel(self, device: torch.device) -> Tensor:
         """Transfer functions of all views, complex128 [C, V, P, Q]."""
-        wavelength = torch.tensor(self.wavelengths, dtype=torch.float64, device=device)
+        wavelength = double(self.wavelengths, device)
         return torch.stack([view_kernel(self.padded, wavelength, view, -view.focus) for view in self.views], 1)
 
     def kernel_for(self, field: Tensor) -> Tensor:

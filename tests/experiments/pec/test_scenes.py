@@ -177,7 +177,7 @@ def test_every_baseline_runs_and_is_reported(tmp_path, words, capsys, monkeypatc
 
 def test_baselines_deconvolve_the_phases_of_no_correction():
     experiment = build(settings())
-    phase = {name: baseline(experiment, name).x.double().numpy() for name in BASELINES[:4]}
+    phase = {name: baseline(experiment, name).x.double().cpu().numpy() for name in BASELINES[:4]}
     columns, rows = (array.spread(np.eye(n)[:, :, None], 0.66, 7)[..., 0] for n in SHAPE)
     exact = np.linalg.solve(columns, phase["none"]) @ np.linalg.inv(rows).T
     assert phase["none"].min() >= 0 and phase["none"].max() < 2 * np.pi and exact.min() < 0
@@ -209,7 +209,7 @@ def test_starts_are_what_their_names_say(frames):
         experiment = build(settings(f"solver.start={kind}", f"frames={frames}"))
         start = experiment.start_phase()
         assert start.dtype == torch.float32 and start.min() >= 0
-        starts[kind] = experiment.heater_phases(start).double().numpy()
+        starts[kind] = experiment.heater_phases(start).double().cpu().numpy()
         assert starts[kind].shape == (frames, 3, *SHAPE)
     spread = {kind: array.spread(phase, 0.66, 7) for kind, phase in starts.items()}
     assert 0.95 * 2 * np.pi < starts["hot"].max() < 2 * np.pi

@@ -23,6 +23,7 @@ from holotorch.experiments.joint.experiment import deconvolved
 from holotorch.experiments.joint.names import NAMES
 from holotorch.experiments.joint.views.sampled import STEPS_OF_ADAM, Group, SampledViews, adam
 from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs.environment import device_name
 from holotorch.experiments.runs.figures import picture_table
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.io.bundled import find_config
@@ -70,13 +71,17 @@ def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[
     warnings.simplefilter("ignore", SamplingWarning)  # of the collapsed method, whose error the verdict states
     amount = QUICK if quick else FULL
     eye = _observer(amount.size)
+    device = eye.scene.device
     foci = sorted(eye.scene.depths)[:: max(1, (PLANES - 1) // 2)]
     wavelengths, optics = eye.scene.settings.wavelengths, [(eye.display, eye.eye(z)) for z in foci]
-    retinas = [Retina(eye.scene.grid, wavelengths, *each, plane=z) for each, z in zip(optics, foci, strict=True)]
+    retinas = [
+        Retina(eye.scene.grid, wavelengths, *each, plane=z).to(device) for each, z in zip(optics, foci, strict=True)
+    ]
     spectra = [PRESETS["sled"](each).samples(TRAINED) for each in wavelengths]
-    spectral = [SpectralRetina(eye.scene.grid, spectra, *each, recompute=True) for each in optics]
+    spectral = [SpectralRetina(eye.scene.grid, spectra, *each, recompute=True).to(device) for each in optics]
     wanted = _wanted(eye, retinas, foci)
-    setup = _Setup(eye, foci, RetinaViews(retinas), RetinaViews(spectral), wanted, ThermalCrosstalk(SIGMA))
+    crosstalk = ThermalCrosstalk(SIGMA).to(device)
+    setup = _Setup(eye, foci, RetinaViews(retinas), RetinaViews(spectral), wanted, crosstalk)
     rows, cost, largest, shown = [], [], 0.0, {"wanted": wanted}
     for seed in amount.seeds:
         methods, costs, warmest = _methods(setup, seed, amount)
@@ -89,8 +94,8 @@ def chain(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[
                 shown.setdefault(f"{name}, shown: {light}", images)
     deviation = _deviation(setup, amount)
     text = [_headline(rows), *_conditions(eye, retinas, deviation, largest, amount), *_lines(rows, cost)]
-    peak = wanted.amax()
-    pixels = {name: tone_map(each.movedim(1, 0), peak=peak).movedim(0, 1) for name, each in shown.items()}
+    peak = wanted.amax().cpu()
+    pixels = {name: tone_map(each.cpu().movedim(1, 0), peak=peak).movedim(0, 1) for name, each in shown.items()}
     short = {name.replace("joint correction ", "joint, "): each for name, each in pixels.items()}
     drawn = {"chart": picture_table(short, [f"{focus * 1e3:.4g} mm" for focus in foci])}
     return rows, {"cost": cost}, drawn, text
@@ -116,7 +121,7 @@ def _methods(setup: _Setup, seed: int, amount: Amount) -> tuple[dict[str, Tensor
 
 def _light_field(setup: _Setup, fields: Tensor, seed: int, steps: int) -> Tensor:
     """Heater phases [F, C, H, W] by one random focus in each step of Adam without heat, corrected afterwards."""
-    unheated = ThermalCrosstalk(0.0)
+    unheated = ThermalCrosstalk(0.0).to(fields.device)
 
     def problem(drawn: list[int]) -> PECProblem:
         views = RetinaViews([setup.views.retinas[v] for v in drawn])
@@ -145,20 +150,21 @@ def _corrected(
 
         def step(solution: Solution) -> None:
             relative = (solution.losses[-1] / solution.losses[0]).mean().item()
-            bar.set_postfix(loss=f"{relative:.2e}", mem=f"{peak_memory() / 1e9:.2f}GB")
+            bar.set_postfix(loss=f"{relative:.2e}", mem=f"{peak_memory(start.device) / 1e9:.2f}GB")
             bar.update()
 
         solver = LBFGS(max_steps=steps, precondition=spread_preconditioner(crosstalk.kernel), tolerance=0.0)
         phase = limit_peak_phase(LIMIT, solver(problem, start, callback=step).x, crosstalk)
     seconds = round(time.perf_counter() - begin, 1)
-    return phase, {"light": light, "steps": steps, "seconds": seconds, "peak_memory_bytes": peak_memory()}
+    memory = peak_memory(start.device)
+    return phase, {"light": light, "steps": steps, "seconds": seconds, "peak_memory_bytes": memory}
 
 
 def _observer(size: int) -> Observer:
     paths = [find_config(f"configs/{kind}/teapot.yaml") for kind in ("eye", "volume")]
     assert paths[0] is not None and paths[1] is not None
     shape = f"hologram={{shape: [{size}, {size}], pitch: {PITCH}, distance: {DISTANCE}, depths: {PLANES}}}"
-    scene = load_config(paths[1], [shape, "device=cpu", *volume_file("teapot")])
+    scene = load_config(paths[1], [shape, *volume_file("teapot")])
     return observer(load_config(paths[0]), scene)
 
 
@@ -170,10 +176,10 @@ def _light(eye: Observer) -> Tensor:
 
 def _random_field(eye: Observer, generator: torch.Generator) -> Tensor:
     """Field [C, H, W] whose light converges to all sources in front of the array, with independent random phases."""
-    wavelengths = torch.tensor(eye.scene.settings.wavelengths, dtype=torch.float64)
-    total = torch.zeros(len(wavelengths), *eye.scene.grid.shape, dtype=torch.complex64)
+    wavelengths, device = torch.tensor(eye.scene.settings.wavelengths, dtype=torch.float64), eye.scene.device
+    total = torch.zeros(len(wavelengths), *eye.scene.grid.shape, dtype=torch.complex64, device=device)
     for depth, light in zip(eye.scene.depths, _light(eye), strict=True):
-        sources = light.sqrt() * phasor(2 * math.pi * torch.rand(light.shape, generator=generator))
+        sources = light.sqrt() * phasor(2 * math.pi * torch.rand(light.shape, generator=generator).to(device))
         total += propagate(sources, eye.scene.grid, wavelengths, depth, tolerance=3e-3)
     return total.conj().resolve_conj()
 
@@ -184,8 +190,8 @@ def _wanted(eye: Observer, retinas: list[Retina], foci: list[float]) -> Tensor:
     A plane beside the focus appears at another scale. Images have the mean 1 in each colour.
     """
     grid, wavelengths = eye.scene.grid, torch.tensor(eye.scene.settings.wavelengths, dtype=torch.float64)
-    total = torch.zeros(len(wavelengths), len(foci), *grid.shape)
-    point = torch.zeros(len(wavelengths), *grid.shape, dtype=torch.complex64)
+    total = torch.zeros(len(wavelengths), len(foci), *grid.shape, device=eye.scene.device)
+    point = torch.zeros(len(wavelengths), *grid.shape, dtype=torch.complex64, device=eye.scene.device)
     point[:, grid.shape[0] // 2, grid.shape[1] // 2] = 1
     for depth, light in zip(eye.scene.depths, _light(eye), strict=True):
         field = propagate(point, grid, wavelengths, depth, tolerance=3e-3).conj().resolve_conj()
@@ -201,7 +207,7 @@ def _wanted(eye: Observer, retinas: list[Retina], foci: list[float]) -> Tensor:
 def _scaled(image: Tensor, scale: float) -> Tensor:
     """``image`` [C, H, W] magnified about sample n // 2 with the same total light."""
     height, width = image.shape[-2:]
-    y, x = ((torch.arange(n) - n // 2) / scale + n // 2 for n in (height, width))
+    y, x = ((torch.arange(n, device=image.device) - n // 2) / scale + n // 2 for n in (height, width))
     # Coordinates of grid_sample: -1 and 1 are the outer edges of the first and last samples.
     positions = torch.stack(torch.meshgrid((2 * y + 1) / height - 1, (2 * x + 1) / width - 1, indexing="ij")[::-1], -1)
     moved = functional.grid_sample(image[None], positions[None], mode="bicubic", align_corners=False)[0]
@@ -227,7 +233,7 @@ def _scores(setup: _Setup, emitted: Tensor, source: str | None) -> tuple[dict[st
             observed = torch.stack([views(each) for each in emitted]).mean(0)
         else:
             frames = [[setup.eye.image(each.conj(), source, focus) for focus in setup.foci] for each in emitted]
-            observed = torch.stack([torch.stack(each, 1) for each in frames]).mean(0)
+            observed = torch.stack([torch.stack(each, 1) for each in frames]).mean(0).to(wanted.device)
         arrives = views(emitted[0]).sum((-2, -1)).mean(-1) / intensity(emitted[0]).sum((-2, -1))
     observed = observed * best_scale(observed, wanted, -3)[:, None, None, None]
     peak = wanted.amax((1, 2, 3), keepdim=True)
@@ -266,11 +272,12 @@ def _worst(rows: list[dict]) -> dict[str, float]:
 
 def _conditions(eye: Observer, retinas: list[Retina], deviation: float, largest: float, amount: Amount) -> list[str]:
     scene = f" (synthetic: {eye.scene.synthetic})" if eye.scene.synthetic else ""
-    checked = amount.checked
+    checked, device = amount.checked, eye.scene.device
+    place = f"; computed on {device_name(device)}" if device.type == "cuda" else ""
     return [
         f"Teapot{scene}, {amount.size} px of {PITCH}, {amount.frames} frames, eyepiece and eye of "
         f"configs/eye/teapot.yaml, {len(retinas)} foci; sigma {SIGMA} px, largest phase {largest:.2f} pi; mean (worst) "
-        f"of {len(amount.seeds)} seed(s)",
+        f"of {len(amount.seeds)} seed(s){place}",
         f"Wanted: incoherent images in closed form; the mean of {checked} random-phase holograms differs from them by "
         f"{deviation:.3f} (1 / sqrt({checked}) is {checked**-0.5:.3f})",
         f"Predicted error of the collapsed propagation: {max(each.plan.predicted_error for each in retinas):.2f}",
