@@ -1,6 +1,10 @@
 """Implementation of the commands ``check``, ``run`` and ``resume`` for an experiment of any kind."""
 
 import os
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,7 @@ from holotorch.experiments.runs.record import runs_inside
 from holotorch.experiments.runs.signals import interruptible
 from holotorch.io.files import write_bytes, write_json
 
+_SILENT = 3.0  # seconds
 NO_FOLDER = Path(os.devnull)  # what ``execute`` returns as the folder in all processes of a run but the first
 
 
@@ -31,8 +36,9 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
             not fit into memory or cannot start.
     """
     kind = find_kind(settings.experiment)
-    experiment = kind.build(settings)
-    plan = kind.plan(experiment)
+    with _announced():
+        experiment = kind.build(settings)
+        plan = kind.plan(experiment)
     with joined_processes(kind.parallel) as rank:
         if rank > 0:  # only the first process writes to the folder
             with interruptible() as signals:
@@ -70,7 +76,21 @@ def print_outcome(folder: Path) -> None:
 def check(settings: Any) -> RunPlan:
     """Plan a run without computing anything."""
     kind = find_kind(settings.experiment)
-    return kind.plan(kind.build(settings))
+    with _announced():
+        return kind.plan(kind.build(settings))
+
+
+@contextmanager
+def _announced() -> Iterator[None]:
+    """Says that a plan is being made if it takes long: that of an eye may take a minute."""
+    words = "reading the inputs and planning ..."
+    timer = threading.Timer(_SILENT, print, (words,), {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def write_preview(settings: Any, path: Path) -> str:

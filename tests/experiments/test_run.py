@@ -20,7 +20,7 @@ from skimage.metrics import structural_similarity
 from holotorch.correction import Solution
 from holotorch.experiments import execute as execute_module
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.execute import execute
+from holotorch.experiments.execute import check, execute
 from holotorch.experiments.pec import run as run_module
 from holotorch.experiments.pec.experiment import PECExperiment, build
 from holotorch.experiments.pec.plan import plan_text, plan_values
@@ -244,6 +244,14 @@ def test_a_solver_that_cannot_start_is_the_users_to_mend(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="the solver cannot start: the gradient vanishes"):
         execute(settings(), tmp_path / "a")
     assert not (tmp_path / "a").exists()
+
+
+def test_a_long_plan_is_announced_and_a_short_one_is_not(monkeypatch, capsys):
+    check(settings())
+    assert "planning" not in capsys.readouterr().err
+    monkeypatch.setattr(execute_module, "_SILENT", 0.0)
+    check(settings())
+    assert capsys.readouterr().err.count("planning") == 1
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is there")

@@ -23,6 +23,8 @@ _EXPECTED = {
     "dict_": "settings, as in {key: value}",
 }
 
+_FILES = ("image", "path", "file", "kernel", "config")  # settings that name a file
+
 
 def validated(source: Source, model: type[Model]) -> Model:
     """Settings from the data of a file. ConfigError with all mistakes, one line each, in the order of the file."""
@@ -71,8 +73,19 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     near = difflib.get_close_matches(str(given)[:100].lower(), re.findall(r"'([^']+)'", expected), 1)
     # A text has a unit already, so only numbers get the hint that a unit is missing.
     hint = entry["ctx"]["hint"] if kind == "quantity" and not isinstance(given, str) else ""
+    if kind.startswith("model_"):
+        hint = _inner(model, entry["loc"], ".".join(map(str, key)), given)
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
     return source.mistake(key, f"expected {expected}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else hint))
+
+
+def _inner(model: type[BaseModel], location: tuple[str | int, ...], section: str, given: Any) -> str:
+    """Hint at the setting within a section that is meant by a value in place of the section."""
+    inside = list(dict.fromkeys(name for option in _options_at(model, location) for name in option.model_fields))
+    files = [name for name in inside if name in _FILES]
+    if isinstance(given, str) and files:
+        return f"; did you mean {' or '.join(f'{section}.{name}' for name in files)}?"
+    return f"; known: {', '.join(f'{section}.{name}' for name in inside)}" if inside else ""
 
 
 def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str, chosen: bool) -> str:

@@ -67,10 +67,12 @@ def runs_inside(folder: Path, command: str, wanted: Callable[[Path], bool] = lam
         wanted: Whether the command takes the run in a folder.
 
     Returns:
-        The text after a semicolon; empty if no wanted run is directly inside.
+        The text after a semicolon; empty if no wanted run is inside, directly or in a folder of several runs.
     """
-    inside = {path.parent for name in SUMMARIES for path in folder.glob(f"*/{name}")}
-    inside |= {path.parent for path in folder.glob("*/config.yaml") if (path.parent / "env.json").is_file()}
+    inside: set[Path] = set()
+    for level in ("*", "*/*"):
+        inside |= {path.parent for name in SUMMARIES for path in folder.glob(f"{level}/{name}")}
+        inside |= {path.parent for path in folder.glob(f"{level}/config.yaml") if (path.parent / "env.json").is_file()}
     runs = sorted(run for run in inside if wanted(run))
     if not runs:
         return ""

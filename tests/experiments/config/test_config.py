@@ -145,7 +145,8 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         ("target.image=missing.png", "no such picture: 'missing.png'"),
         ("propagator.distance=1 mm", "propagator.distance: a setting of kind fresnel and angular_spectrum, not of"),
         ("solver={}", "solver.kind: expected one of apg, adam, lbfgs, got 'none'"),
-        ("solver=3", "solver: expected settings, as in {key: value}, got 3"),
+        ("solver=3", "solver: expected settings, as in {key: value}, got 3; known: solver.kind, solver.max_steps, "),
+        ("target=photo.png", "expected settings, as in {key: value}, got 'photo.png'; did you mean target.image?"),
         ("seed=-1", "seed: expected greater than or equal to 0, got -1"),
         ("grid.shape=", "grid.shape: expected a whole number, got nothing"),
         (

@@ -64,4 +64,5 @@ def test_the_command_for_a_name_with_a_space_can_be_pasted_and_many_names_are_cu
         (tmp_path / "runs" / f"f{number}").mkdir()
         (tmp_path / "runs" / f"f{number}" / "interrupted.json").write_text("{}")
     assert "e_track, " in (text := runs_inside(tmp_path / "runs", "")) and "f0, ...;" in text and "f1" not in text
+    assert f"{tmp_path}/runs/a pec, " in runs_inside(tmp_path, "holotorch view {}")  # in a folder of several runs
     assert runs_inside(tmp_path / "runs" / "other", "") == runs_inside(tmp_path / "nowhere", "") == ""
