@@ -130,7 +130,10 @@ def _construct(loader, node: yaml.Node, name: str, positions: dict[Key, str], ke
     if isinstance(node, yaml.SequenceNode):
         return [_construct(loader, item, name, positions, (*key, i), mistakes) for i, item in enumerate(node.value)]
     try:
-        return loader.construct_object(node)
+        value = loader.construct_object(node)
+        if isinstance(value, int):
+            str(value)  # ValueError beyond 4300 digits, which no message could state; YAML has such hexadecimal numbers
+        return value
     except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
         # Examples are an impossible date, a number that is too large, and a tag that does not fit its value.
         mistakes.append(f"{positions[key]}: {'.'.join(map(str, key))}: not a value: {error}")

@@ -132,6 +132,7 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         ("grid.pitch=9", "grid.pitch: expected a length within 1 nm .. 2 mm, got 9"),
         ("propagator={kind: fresnel, distance: 0}", "propagator.distance: expected a distance of 1 um or more"),
         ("solver.learning_rate=1", "a setting of kind adam, not of apg; to change the kind give the whole section"),
+        (f"seed=0x{4000 * '9'}", "seed: not a value: Exceeds the limit (4300 digits)"),
         ("seed=2001-99-99", "seed: not a value: month must be in 1..12"),
         ("grid.pitch=-1um", "grid.pitch: expected a length within 1 nm .. 2 mm, got '-1um'"),
         ("modulator.sgima_px=1", "modulator.sgima_px: unknown setting; did you mean 'sigma_px'?"),
