@@ -24,22 +24,22 @@ def devices(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dic
     """Rows of every task and device, no further table, the picture, and the verdict."""
     warnings.simplefilter("ignore", SamplingWarning)  # times are charted here, and the errors by other charts
     amount = QUICK if quick else FULL
-    places, rows = find_places(), []
+    available, rows = computing_devices(), []
     for task in (bar := tqdm([*tasks(amount)], desc="devices", unit="task")):
         bar.set_postfix_str(task.name)
-        rows += _rows(task, places, amount.rounds)
-    return rows, {}, {"chart": _draw(rows)}, _verdict(rows, places)
+        rows += _rows(task, available, amount.rounds)
+    return rows, {}, {"chart": _draw(rows)}, _verdict(rows, available)
 
 
-def find_places() -> list[torch.device]:
+def computing_devices() -> list[torch.device]:
     """The processor, and a GPU if torch finds one."""
     return [torch.device("cpu"), *([torch.device("cuda")] if torch.cuda.is_available() else [])]
 
 
-def _rows(task: Task, places: list[torch.device], rounds: tuple[int, int]) -> list[dict[str, Any]]:
+def _rows(task: Task, available: list[torch.device], rounds: tuple[int, int]) -> list[dict[str, Any]]:
     """One row for each device; without a GPU, one that says that it was not measured there."""
     rows, wanted, base = [], None, 0.0
-    for device, count in zip(places, rounds, strict=False):
+    for device, count in zip(available, rounds, strict=False):
         result, seconds, memory = _measure(task, device, count)
         wanted, base = (result, statistics.median(seconds)) if wanted is None else (wanted, base)
         rows.append(
@@ -58,7 +58,7 @@ def _rows(task: Task, places: list[torch.device], rounds: tuple[int, int]) -> li
                 "thesis_seconds": "" if task.thesis is None else task.thesis,
             }
         )
-    if len(places) == 1:
+    if len(available) == 1:
         rows.append({"task": task.name, "method": task.method, "seconds_of": task.unit, "device": NOT_MEASURED})
     return rows
 
@@ -88,20 +88,20 @@ def _difference(result: Tensor, wanted: Tensor) -> float:
     return ((result - wanted)[both].norm() / wanted[both].norm()).item()
 
 
-def _verdict(rows: list[dict[str, Any]], places: list[torch.device]) -> list[str]:
-    names = [device_name(device) for device in places]
+def _verdict(rows: list[dict[str, Any]], available: list[torch.device]) -> list[str]:
+    names = [device_name(device) for device in available]
     lines = [f"torch {torch.__version__}; {', '.join(names)}; medians, each task on one device after the other"]
     for row in rows:
-        if row["device"] == NOT_MEASURED or len(places) > 1 and row["device"] == names[0]:
+        if row["device"] == NOT_MEASURED or len(available) > 1 and row["device"] == names[0]:
             continue
         what = ", ".join(part for part in (row["task"], row["method"]) if part)
         line = f"{what}: {row['seconds']} s a {row['seconds_of']} on {row['device']}"
-        if len(places) > 1:
+        if len(available) > 1:
             line += f", {row['over_processor']} times as fast as the processor, results differ by {row['difference']}"
         if row["thesis_seconds"]:
             line += f"; the thesis's GPU {row['thesis_seconds']} s"
         lines.append(line)
-    if len(places) == 1:
+    if len(available) == 1:
         lines.append("GPU: not measured, since torch finds no CUDA device here")
     return lines
 
@@ -113,8 +113,8 @@ def _draw(rows: list[dict[str, Any]]) -> bytes:
     axes = figure.subplots()
     for k, device in enumerate(dict.fromkeys(row["device"] for row in measured)):
         own = [row for row in measured if row["device"] == device]
-        places = [labels.index((row["task"], row["method"])) for row in own]
-        axes.semilogx([float(row["seconds"]) for row in own], places, "os"[k], color=f"C{k}", label=device)
+        heights = [labels.index((row["task"], row["method"])) for row in own]
+        axes.semilogx([float(row["seconds"]) for row in own], heights, "os"[k], color=f"C{k}", label=device)
     thesis = {labels.index((r["task"], r["method"])): r["thesis_seconds"] for r in measured if r["thesis_seconds"]}
     if thesis:
         axes.semilogx(

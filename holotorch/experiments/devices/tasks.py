@@ -49,7 +49,7 @@ class Task:
 
     Attributes:
         name: What is computed, with its size.
-        method: How, where there are several ways.
+        method: How, where there are several methods.
         unit: What the seconds are of.
         build: Prepares it on a device, and returns a call that computes it there.
         times: Factor from the seconds of a call to those of a unit.

@@ -33,14 +33,14 @@ def test_the_dissertation_s_scenes_are_timed_at_its_size():
 @pytest.mark.parametrize("gpu", [False, True])
 def test_rows_and_verdict(gpu: bool, monkeypatch, tmp_path, capsys):
     """A GPU is stood in for by the processor under another name, whose results differ a little."""
-    places = [torch.device("cpu"), torch.device("cpu", 0)] if gpu else [torch.device("cpu")]
+    available = [torch.device("cpu"), torch.device("cpu", 0)] if gpu else [torch.device("cpu")]
     calls: list[str] = []
 
     def build(size: float, device: torch.device):
         calls.append(str(device))
         return lambda: torch.full((4,), size if device.index is None else size * (1 + 1e-6), dtype=torch.float64)
 
-    monkeypatch.setattr(chart, "find_places", lambda: places)
+    monkeypatch.setattr(chart, "computing_devices", lambda: available)
     monkeypatch.setattr(chart, "device_name", lambda device: "a CPU" if device.index is None else "a GPU")
     monkeypatch.setattr(chart, "tasks", lambda _: [Task("sum", "slow", "step", partial(build, 2.0), 10.0, 3.5)])
     assert main(["chart", "devices", "--out", str(tmp_path)]) == 0
