@@ -87,9 +87,23 @@ def override(source: Source, word: str, mistakes: list[str]) -> None:
     parent[key[-1]] = _parse(text, position, {}, key, mistakes)
 
 
+class _Loader(yaml.SafeLoader):
+    """Refuses deep nesting while reading, since PyYAML's time grows with the square of the number of open brackets."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.depth > _MAX_DEPTH:
+            raise RecursionError
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
 def _parse(text: str, name: str, positions: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
     try:
-        loader = yaml.SafeLoader(text)
+        loader = _Loader(text)
         loader.name = name
         node = loader.get_single_node()
         return None if node is None else _construct(loader, node, name, positions, key, mistakes)
