@@ -97,11 +97,10 @@ def _poses_of(folder: Path) -> Path:
 @contextmanager
 def _rendered(options: argparse.Namespace) -> Iterator[None]:
     """Context in which the source ``synthetic`` is a rendered recording, in a temporary folder."""
-    from holotorch.experiments.streaming.stream import address
+    from holotorch.experiments.streaming.stream import receivers_of
     from holotorch.experiments.tracking.config import FRAMES, SYNTHETIC
 
-    for place in options.to or ():
-        address(place.partition("=")[0])  # raises for a wrong one, before the time that rendering takes
+    receivers_of(options.to or (), options.headset)  # raises for a wrong one, before the time that rendering takes
     if options.sources != [SYNTHETIC] or not (options.to or options.view or options.igtl is not None):
         yield
         return

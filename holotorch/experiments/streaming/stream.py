@@ -175,11 +175,7 @@ def stream(
     Raises:
         ConfigError: There is no source or no receiver, an address or file cannot be read, or pyigtl is missing.
     """
-    receivers: dict[Path | None, list[tuple[str, int]]] = {}
-    for text in to:
-        place, _, file = text.partition("=")
-        receivers.setdefault(Path(file) if file else headset, []).append(address(place))
-    frames = {file: Frame.of(file) for file in {*receivers, headset}}
+    receivers, frames = receivers_of(to, headset)
     if not receivers and igtl is None and page is None:
         raise ConfigError([f"say to whom: --to HOST:PORT, such as --to 127.0.0.1:{PORT}, or --igtl 18944 for Slicer"])
     if rate is not None and not (math.isfinite(rate) and rate > 0):
@@ -215,6 +211,26 @@ def stream(
         page is not None or not links or server is not None or any(link.sent or not link.errors for link in links)
     )
     return Streamed(count[0], complete, delivered)
+
+
+def receivers_of(
+    to: Sequence[str], headset: Path | None
+) -> tuple[dict[Path | None, list[tuple[str, int]]], dict[Path | None, Frame]]:
+    """Addresses of the receivers by headset file (None: no file), and the frame of each file.
+
+    Raises:
+        ConfigError: An address or a file cannot be read, or no computer has the name of a receiver.
+    """
+    receivers: dict[Path | None, list[tuple[str, int]]] = {}
+    for text in to:
+        place, _, file = text.partition("=")
+        host, port = address(place)
+        try:
+            socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        except OSError as error:
+            raise ConfigError([f"no way to {host}:{port}: {error.strerror or error}"]) from None
+        receivers.setdefault(Path(file) if file else headset, []).append((host, port))
+    return receivers, {file: Frame.of(file) for file in {*receivers, headset}}
 
 
 def _config_error(error: OSError) -> Exception:

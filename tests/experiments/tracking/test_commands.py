@@ -372,6 +372,8 @@ def test_stream_renders_nothing_for_nobody(monkeypatch, capsys):
     monkeypatch.setattr(synthetic, "write_synthetic", lambda *_, **__: pytest.fail("rendered"))
     assert "say to whom" in said(capsys, "stream", "synthetic")
     assert "expected a port from 1 to 65535" in said(capsys, "stream", "synthetic", "--to", "127.0.0.1:99999")
+    assert "no way to nobody.invalid:18950: " in said(capsys, "stream", "synthetic", "--to", "nobody.invalid")
+    assert "absent.yaml: cannot read" in said(capsys, "stream", "synthetic", "--to", "127.0.0.1=absent.yaml")
 
 
 LOADED = """
