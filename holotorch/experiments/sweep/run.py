@@ -10,11 +10,14 @@ from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.registry import find_kind, load_config
+from holotorch.experiments.report import outcome_lines
 from holotorch.experiments.runs.fingerprint import differences, fingerprint
 from holotorch.experiments.sweep.engines import engine
 from holotorch.experiments.sweep.one import COMPLETE, FAILED, INTERRUPTED, Outcome
 from holotorch.experiments.sweep.points import Point, points
 from holotorch.experiments.sweep.results import PAGE, TABLE, finished, write_results
+
+_LISTED = 24  # most runs whose main numbers are printed
 
 
 def check_sweep(config: str, arguments: Sequence[str]) -> str:
@@ -66,11 +69,20 @@ def run_sweep(
     write_results(out, grid, statuses)
     counts = Counter(statuses.get(point.name, "missing") for point in grid)
     print(f"{len(grid)} runs: " + ", ".join(f"{count} {status}" for status, count in counts.items()))
+    for line in _main_numbers(out, [point.name for point in grid if statuses.get(point.name) == COMPLETE]):
+        print(line)
     print(out / (PAGE if counts[COMPLETE] else TABLE))
     if interrupted or counts[INTERRUPTED] or counts["missing"]:
         print("interrupted; the same command continues the sweep", file=sys.stderr)
         return 130
     return 1 if counts[FAILED] else 0
+
+
+def _main_numbers(out: Path, names: Sequence[str]) -> list[str]:
+    """A line with the main numbers of each complete run."""
+    width = max(map(len, names), default=0)
+    lines = [f"{name:{width}}  {next(iter(outcome_lines(out / name)), COMPLETE)}" for name in names[:_LISTED]]
+    return [*lines, f"and {len(names) - _LISTED} more in {out / TABLE}"] if len(names) > _LISTED else lines
 
 
 def _validated(config: str, grid: Sequence[Point]) -> list[Any]:

@@ -69,9 +69,11 @@ def test_a_second_call_computes_only_what_is_missing(toy, tmp_path, monkeypatch,
     assert [(row["steps"], row["status"], row["total"]) for row in rows(out)] == [
         ("2", "complete", "3"), ("4", "complete", "10"),
     ]  # fmt: skip
+    monkeypatch.setattr(ToyKind, "outcome", lambda _, summary: [f"Total      {summary['total']}"], raising=False)
     assert main(["sweep", toy, "steps=2,4,5", "--out", str(out)]) == 0
     assert len(steps) == 11 and len(rows(out)) == 3
-    assert "3 runs: 3 complete" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "3 runs: 3 complete" in text and "steps=2  Total      3\n" in text and "steps=5  Total      15\n" in text
     page = (out / "report.html").read_text()
     assert "total 3" in page and "total 15" in page and "sweep.csv" in page
     # The folders belong to this sweep: with another fixed setting they are not overwritten.
