@@ -35,6 +35,7 @@ MEANINGS = {
     "LBFGSSettings.memory": "number of stored pairs of a step and its change of gradient",
     "ReportSettings.metrics": "scores of the report; the first is shown during the run",
     "ReportSettings.baselines": "methods that the corrected hologram is compared with",
+    "ReportSettings.kernel_noise": "deviation of every tap of the heat kernel (centre 1): what such noise costs",
     "StudySettings.study": "the comparison to make",
     "StudySettings.max_steps": "largest number of steps of each solver",
     # Volumes.

@@ -171,6 +171,7 @@ class ReportSettings(Settings):
         "psnr",
     )
     baselines: Annotated[tuple[Baseline, ...], BeforeValidator(several)] = ("none", "basic_ipec")
+    kernel_noise: Annotated[Number, Field(gt=0, le=1)] | None = None
 
 
 class PECSettings(Settings):

@@ -12,7 +12,10 @@ from holotorch.correction.problem import best_scale
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.weight import zone_scores
 from holotorch.metrics import SSIM_WINDOW, dark_spots, psnr, ssim
+from holotorch.modulator import PhasedArray, ThermalCrosstalk
 from holotorch.optics import CroppedKernel
+
+NOISY_KERNELS = 4  # chips on which a run with report.kernel_noise tries its phases
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,27 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     if weight := experiment.settings.target.weight:
         numbers["zones"] = zone_scores(weight, picture, experiment.image, experiment.lit)
     return Result(_all_colours(experiment, phase.cpu()), picture, isolated, numbers)
+
+
+def with_noisy_kernels(experiment: PECExperiment, phase: Tensor, noise: float) -> dict[str, Any]:
+    """Scores of heater phases [F, C, H, W] on chips whose heat spreads a little otherwise than was measured.
+
+    The kernel of each chip is the assumed one with Gaussian noise of standard deviation ``noise`` in every tap but the
+    centre, which is 1; a rise stays within 0 and 1. The means over the lit colours are lists, a value for each chip.
+    """
+    assumed = experiment.array.crosstalk.kernel.detach().cpu().double()
+    generator, scores = torch.Generator().manual_seed(experiment.settings.seed), []
+    for _ in range(NOISY_KERNELS):
+        kernel = assumed + noise * torch.randn(assumed.shape, generator=generator, dtype=assumed.dtype)
+        kernel = kernel.clamp(0, 1)
+        kernel[kernel.shape[0] // 2, kernel.shape[1] // 2] = 1
+        chip = PhasedArray(experiment.wavelengths, ThermalCrosstalk.from_patch(kernel)).to(experiment.device)
+        formed = experiment.mean_intensity(lambda frame, chip=chip: chip(frame.double()), phase.detach())
+        formed = experiment.picture_in(formed).cpu()
+        picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
+        scores.append(_scores(experiment, picture, experiment.image))
+    means = [f"{name}_mean" for name in experiment.settings.report.metrics]
+    return {"noise": noise} | {name: [score[name] for score in scores] for name in means}
 
 
 def _heating(experiment: PECExperiment, phase: Tensor) -> dict[str, Any]:

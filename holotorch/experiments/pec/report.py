@@ -41,7 +41,8 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
     if (between := corrected.get("between_samples", {}).get("ssim_mean")) is not None:
         scores.append(f"SSIM {_fixed(between, 3)} midway between the samples, which a viewer sees as well")
     scores.append(f"hottest pixel {max(corrected['peak_temperature_rise_K']):.0f} degC above ambient")
-    return [f"Result     {', '.join(scores)}", *error_line(summary)]
+    noise = [f"Kernel     {_with_noise(numbers)}"] if (numbers := corrected.get("kernel_noise")) else []
+    return [f"Result     {', '.join(scores)}", *noise, *error_line(summary)]
 
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:
@@ -56,6 +57,8 @@ def pec_section(run: RunRecord) -> list[str]:
     parts = [heading(run.title, run.summary["status"])]
     parts.append(_table([{"method": METHOD_NAMES.get(name, name)} | _cells(each) for name, each in methods.items()]))
     parts.append(element("p", _verdict(run)))
+    if numbers := methods["corrected"].get("kernel_noise"):
+        parts.append(element("p", f"Should the heat kernel be wrong, with {_with_noise(numbers)}."))
     if sentence := error_sentence(run.summary):
         parts.append(element("p", sentence))
     parts += [*_zone_table(methods), '<div class="row">']
@@ -113,6 +116,14 @@ def _verdict(run: RunRecord) -> str:
         "are taken at the samples of the image, one per pixel, where the solver controls the light. 'SSIM half a "
         f"sample off' is the score midway between four samples{speckle}; a viewer sees that light as well.{single}"
     )
+
+
+def _with_noise(numbers: dict[str, Any]) -> str:
+    """Worst scores with noise in the taps of the heat kernel, in words."""
+    names = {"ssim_mean": "SSIM {:.3f}", "psnr_mean": "PSNR {:.1f} dB"}
+    scores = [text.format(min(numbers[name])) for name, text in names.items() if name in numbers]
+    chips = f"at worst of {max(len(value) for value in numbers.values() if isinstance(value, list))} chips"
+    return f"noise of {100 * numbers['noise']:g} % of the centre in every tap: {', '.join(scores)} {chips}"
 
 
 def _zone_table(methods: dict[str, dict[str, Any]]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from holotorch.correction import Solution
 from holotorch.experiments.pec.baselines import baseline
-from holotorch.experiments.pec.evaluation import Result, evaluate, speckle_spots
+from holotorch.experiments.pec.evaluation import Result, evaluate, speckle_spots, with_noisy_kernels
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.measured import pec_errors
 from holotorch.experiments.pec.progress import Log
@@ -64,6 +64,9 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
             results["corrected"].numbers.update(attempts)
+            if (noise := settings.report.kernel_noise) is not None and not signals:
+                phase = results["corrected"].phase.to(experiment.device)
+                results["corrected"].numbers["kernel_noise"] = with_noisy_kernels(experiment, phase, noise)
             files.write(save_array, out / "arrays" / "phase.npy", results["corrected"].phase.float())
         results |= _baselines(experiment, signals)
         errors = None if signals else measured_values(lambda: pec_errors(experiment, solution))
@@ -83,7 +86,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
 
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
-    free = {"device", "report.baselines", "solver.reruns"}  # baselines and reruns are computed after the solver
+    free = {"device", "report.baselines", "report.kernel_noise", "solver.reruns"}  # computed after the solver
     if experiment.settings.tolerance is None:
         free.add("tolerance")  # checkpoints of before there was one do not have it
     if experiment.settings.solver.kind != "lbfgs":  # the stages of L-BFGS depend on max_steps

@@ -10,6 +10,7 @@ import paths
 import pytest
 import torch
 from oracles import array
+from scipy.ndimage import convolve
 
 from holotorch.experiments.execute import execute
 from holotorch.experiments.pec import baselines as module
@@ -255,3 +256,27 @@ def test_a_black_colour_stays_dark_in_every_scene(tmp_path, words):
     assert numbers["ssim_mean"] == pytest.approx(np.mean(numbers["ssim"][1:]))
     with open(tmp_path / "a" / "metrics.csv") as stream:
         assert stream.readline().strip().endswith("ssim_mean,loss_530nm,loss_445nm")
+
+
+def test_noise_in_a_measured_kernel_is_tried_on_four_chips(tmp_path):
+    kernel = array.spread(np.pad([[1.0]], 2), 0.66, 5)
+    np.save(tmp_path / "kernel.npy", kernel)
+    scores = {}
+    for noise in (1e-9, 0.01, 0.03):
+        words = [f"modulator={{kernel: {tmp_path / 'kernel.npy'}}}", f"report.kernel_noise={noise}", "frames=2"]
+        assert execute(settings(*words, "seed=5"), tmp_path / str(noise))[1]
+        numbers = json.loads((tmp_path / str(noise) / "summary.json").read_text())["methods"]["corrected"]
+        assert numbers["kernel_noise"].pop("noise") == noise
+        scores[noise] = numbers["kernel_noise"]
+        assert f"noise of {100 * noise:g} % of the centre" in (tmp_path / str(noise) / "report.html").read_text()
+    assert scores[1e-9]["ssim_mean"] == pytest.approx([numbers["ssim_mean"]] * 4, abs=1e-5)
+    assert (np.array(scores[0.01]["psnr_mean"]) > scores[0.03]["psnr_mean"]).all()  # three times the same noise
+    phase, target = (np.load(tmp_path / "0.03" / "arrays" / f"{name}.npy") for name in ("phase", "target"))
+    generator = torch.Generator().manual_seed(5)
+    for psnr, ssim in zip(scores[0.03]["psnr_mean"], scores[0.03]["ssim_mean"], strict=True):
+        other = kernel + 0.03 * torch.randn(5, 5, generator=generator, dtype=torch.float64).numpy()
+        other[2, 2] = 1
+        heat = [[convolve(one, other.clip(0, 1), mode="constant") for one in frame] for frame in phase.astype(float)]
+        formed = seen(array.far(np.exp(1j * np.array(heat)))) * target.mean((1, 2), keepdims=True)
+        assert psnr == pytest.approx(np.mean([array.psnr(formed[c], target[c]) for c in range(3)]), rel=1e-6)
+        assert ssim == pytest.approx(np.mean([array.ssim(formed[c], target[c]) for c in range(3)]), abs=1e-6)
