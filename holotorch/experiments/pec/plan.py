@@ -19,6 +19,9 @@ from holotorch.optics import diffraction_angle, plan_propagation, unaliased_dist
 # Memory in bytes, fitted to whole commands (scripts/predictions.py --memory).
 _BASE_BYTES = 430e6  # the interpreter with its libraries, and the report
 _PIXEL_BYTES = {"apg": 70, "adam": 90, "lbfgs": 190}  # in the solver, per pixel of all colours and frames
+# The same where frames are propagated in turn, and what is saved of it if the arrays of each frame are not in the heap,
+# in which they leave gaps.
+_IN_TURN_BYTES, _GAPS_BYTES = {"apg": 85, "adam": 85, "lbfgs": 215}, 45
 _SOLVER_BYTES = 60  # in the solver, per padded sample of the frames that are propagated at once
 _SCORED_BYTES = 350  # in the float64 simulation of the result with its scores, per pixel of all colours of a frame
 _EVALUATION_BYTES = 112  # the same in the near field, per grid sample of one colour besides
@@ -77,7 +80,10 @@ def _peak_bytes(experiment: PECExperiment) -> float:
     frame, padded = colours * samples, colours * padded_samples(experiment)
     at_once = frames if frames * frame <= FRAMES_AT_ONCE or not experiment.joint else 1
     double = experiment.dtype.itemsize / 4
-    solver = double * (_PIXEL_BYTES[settings.solver.kind] * frames * frame + _SOLVER_BYTES * at_once * padded)
+    per_pixel = (_PIXEL_BYTES if at_once == frames else _IN_TURN_BYTES)[settings.solver.kind]
+    if at_once < frames and 4 * frame >= _MAPPED:
+        per_pixel -= _GAPS_BYTES
+    solver = double * (per_pixel * frames * frame + _SOLVER_BYTES * at_once * padded)
     images = frame * max(1, (1 + len(experiment.distances)) // 2)
     scored = _SCORED_BYTES * images
     if experiment.distances:
