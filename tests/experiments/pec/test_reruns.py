@@ -43,6 +43,7 @@ def test_the_attempt_with_the_fewest_dark_spots_is_kept(monkeypatch, spots, kept
     assert list(counted) == spots[:attempts] and solved == list(range(1, attempts))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_start_that_leaves_vortices_is_detected_and_solved_again(tmp_path):
     """From nearly flat phases a Fourier hologram ends with vortices, from random ones without (thesis Sec. 4.4.5.2)."""
     found = {}

@@ -24,7 +24,9 @@ from holotorch.tracking.simulation.varied import VariedWorld
 from holotorch.tracking.simulation.world import World, aimed
 
 TILT = math.radians(20)
-SMALL = Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, placed=1, stream=2, repeats=1, share=0.06)
+# Each pose of ``STILL`` at rest, and one of them at another point.
+AT_REST = (("tip", (520, 20)), ("tip", (520, 5)), ("middle of the bands", (520, 20)))
+SMALL = Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, placed=1, resting=AT_REST, stream=2, repeats=1, share=0.04)
 
 
 def small(**changes) -> World:
