@@ -49,6 +49,7 @@ def test_a_start_that_leaves_vortices_is_detected_and_solved_again(tmp_path):
     found = {}
     for start in ("flat", "hot"):
         changes = [f"solver.start={start}", "solver.reruns=1", "grid.shape=[48, 48]", "report.baselines=[]"]
+        changes += ["solver.max_steps=150"]
         assert main(["run", "configs/pec/fourier.yaml", *changes, "--out", str(tmp_path / start)]) == 0
         found[start] = json.loads((tmp_path / start / "summary.json").read_text())["methods"]["corrected"]
     assert found["hot"]["dark_spots"] == [0, 0, 0] and found["hot"]["dark_spots_of_attempts"] == [0]

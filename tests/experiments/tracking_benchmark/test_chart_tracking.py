@@ -2,6 +2,7 @@
 
 import csv
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -39,6 +40,7 @@ def small(**changes) -> World:
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_tracking, "scene", lambda _: small())
     monkeypatch.setattr(chart_tracking, "FULL", SMALL)
+    monkeypatch.setattr(chart_tracking, "VariedWorld", partial(VariedWorld, size=(540, 960)))
     for module in (chart_tracking, tracking_bench):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
     monkeypatch.setattr(tracking_bench, "tip_bounds", lambda *_: Bounds(1e-9 * torch.eye(3), 2e-9 * torch.eye(3)))
