@@ -153,7 +153,8 @@ class PECProblem(nn.Module):
             expected = "end in (C, H, W)" if axes == 3 else "give an image that ends in (C, *image)"
             raise ValueError(f"phase must {expected} = {tuple(target.shape[-axes:])}, got {tuple(formed.shape)}")
         try:
-            torch.broadcast_shapes(formed.shape, target.shape)
+            if formed.shape != target.shape:  # the function takes 30 us, and imports sympy in its first call
+                torch.broadcast_shapes(formed.shape, target.shape)
         except RuntimeError:
             one, other = tuple(formed.shape[:-axes]), tuple(target.shape[:-axes])
             raise ValueError(f"phase and target must have leading axes that broadcast, got {one} and {other}") from None

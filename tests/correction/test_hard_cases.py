@@ -101,7 +101,7 @@ def test_hard_targets(kind, dimmed, amplitude):
     crosstalk = ThermalCrosstalk(0.66, 7)
     for options in ({}, {"scale_free": True}):
         problem = make(dimmed * picture(kind), crosstalk, amplitude=amplitude, **options)
-        for solver in solvers(crosstalk):
+        for solver in solvers(crosstalk, 15):
             solution = solver(problem, hot((16, 16)))
             assert torch.isfinite(solution.x).all() and torch.isfinite(solution.losses).all()
             assert solution.losses[-1] < solution.losses[0] and (solution.x >= 0).all()

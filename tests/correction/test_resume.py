@@ -1,7 +1,9 @@
 """A run that is stopped and resumed is the run that was not, to the bit."""
 
 import io
+from collections.abc import Collection
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -31,6 +33,7 @@ SOLVERS = {
     "LBFGS, preconditioned": LBFGS(2, spread_preconditioner(CROSSTALK.kernel), **RULE),
 }
 STEPS = LBFGS(3, spread_preconditioner(CROSSTALK.kernel), max_steps=24, tolerance=0)
+AFTER, AFTER_STAGES = (1, 4, 9), (1, 4, 5, 8, 9, 13, 20, 23)  # steps in which runs are stopped
 each_solver = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
 
 
@@ -49,21 +52,44 @@ def beginning() -> torch.Tensor:
     return torch.rand(2, 12, 17, generator=torch.Generator().manual_seed(8), dtype=torch.float64) * 6
 
 
-def interrupted(run, after: int) -> dict:
-    """The state that the callback of ``run`` sees in step ``after``, where it ends the run; through a file."""
-    seen: list[Solution] = []
+def interrupted(run, after: Collection[int]) -> dict[int, dict]:
+    """The states that the callback of ``run`` sees in the steps ``after``, in the last of which it ends the run.
+
+    Each goes through a file.
+    """
+    files: dict[int, io.BytesIO] = {}
+    step = 0
 
     def stop(now: Solution):
-        seen.append(now)
-        if len(seen) == after:
+        nonlocal step
+        step += 1
+        if step in after:
+            torch.save(now.state, files.setdefault(step, io.BytesIO()))
+        if step == max(after):
             raise Interrupted
 
     with pytest.raises(Interrupted):
         run(callback=stop)
-    file = io.BytesIO()
-    torch.save(seen[-1].state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
+    states = {}
+    for step, file in files.items():
+        file.seek(0)
+        states[step] = torch.load(file, weights_only=True)
+    return states
+
+
+@cache
+def whole_and_states(name: str) -> tuple[Solution, dict[int, dict]]:
+    """The run of a solver that was not stopped, and its states where it was."""
+    problem, start, solver = make_problem(), beginning(), SOLVERS[name]
+    return solver(problem, start), interrupted(lambda callback: solver(problem, start, callback=callback), AFTER)
+
+
+@cache
+def stages_and_states(limit: float | None) -> tuple[list[Stage], Solution, dict[int, dict]]:
+    """A penalty schedule, its run that was not stopped, and the states where it was."""
+    stages, start = penalty_schedule(make_problem, STEPS, CROSSTALK.total, limit), beginning()
+    states = interrupted(lambda callback: run_stages(stages, start, callback=callback), AFTER_STAGES)
+    return stages, run_stages(stages, start), states
 
 
 def assert_same(resumed: Solution, whole: Solution):
@@ -75,20 +101,18 @@ def assert_same(resumed: Solution, whole: Solution):
         assert torch.equal(resumed.state[name], values), name
 
 
-@each_solver
-@pytest.mark.parametrize("after", [1, 4, 9])
-def test_resumed_after_an_interruption(solver, after):
-    problem, start = make_problem(), beginning()
-    whole = solver(problem, start)
-    state = interrupted(lambda callback: solver(problem, start, callback=callback), after)
-    assert_same(solver(problem, start, resume=state), whole)
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("after", AFTER)
+def test_resumed_after_an_interruption(name, after):
+    whole, states = whole_and_states(name)
+    assert_same(SOLVERS[name](make_problem(), beginning(), resume=states[after]), whole)
 
 
-@each_solver
-def test_more_steps_than_were_asked_for_at_first(solver):
+@pytest.mark.parametrize("name", SOLVERS)
+def test_more_steps_than_were_asked_for_at_first(name):
     problem, start = make_problem(), beginning()
-    short = replace(solver, max_steps=6)(problem, start)
-    assert_same(solver(problem, start, resume=short.state), solver(problem, start))
+    short = replace(SOLVERS[name], max_steps=6)(problem, start)
+    assert_same(SOLVERS[name](problem, start, resume=short.state), whole_and_states(name)[0])
 
 
 @each_solver
@@ -101,21 +125,20 @@ def test_a_finished_run_does_not_go_on(solver):
 
 
 @pytest.mark.parametrize("limit", [None, 12.0])
-@pytest.mark.parametrize("after", [1, 4, 5, 8, 9, 13, 20, 23])
+@pytest.mark.parametrize("after", AFTER_STAGES)
 def test_stages_resume_within_and_between_each_other(limit, after):
-    stages, start = penalty_schedule(make_problem, STEPS, CROSSTALK.total, limit), beginning()
-    whole = run_stages(stages, start)
-    state = interrupted(lambda callback: run_stages(stages, start, callback=callback), after)
-    assert_same(run_stages(stages, start, resume=state), whole)
-    assert_same(run_stages(stages, start, resume=whole.state), whole)
+    stages, whole, states = stages_and_states(limit)
+    assert_same(run_stages(stages, beginning(), resume=states[after]), whole)
+    assert_same(run_stages(stages, beginning(), resume=whole.state), whole)
 
 
 def test_stages_of_different_solvers_resume():
     stages = [Stage(make_problem(), solver) for solver in SOLVERS.values()]
     whole = run_stages(stages, beginning())
-    for after in (3, 20, len(whole.losses) - 2):
-        state = interrupted(lambda callback: run_stages(stages, beginning(), callback=callback), after)
-        assert_same(run_stages(stages, beginning(), resume=state), whole)
+    after = (3, 20, len(whole.losses) - 2)
+    states = interrupted(lambda callback: run_stages(stages, beginning(), callback=callback), after)
+    for step in after:
+        assert_same(run_stages(stages, beginning(), resume=states[step]), whole)
 
 
 def assert_states_stay(run):

@@ -18,6 +18,12 @@ class Blank:
         """Leave the picture empty."""
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures are composed as ever, but not turned into pixels, which takes longer than a small run."""
+    monkeypatch.setattr(figures, "FigureCanvasAgg", Blank)
+
+
 @pytest.fixture(scope="module")
 def tiny():
     """For tiny runs: no figures, which take longer than they do, and one thread, as two would wait for each other."""

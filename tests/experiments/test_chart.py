@@ -34,6 +34,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     assert "predicted error: true / predicted" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_quick_chart_says_so_and_is_not_beside_the_committed_ones(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_propagation, "QUICK", replace(SMALL, cases=(SMALL.shown,), predictions=2))
     monkeypatch.setattr(chart_propagation, "FULL", None)  # the quick form reads nothing of the full one

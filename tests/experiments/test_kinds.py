@@ -136,6 +136,7 @@ def test_a_run_is_named_after_the_data_of_the_user_or_its_configuration(config, 
     assert run_name(f"configs/{config}", ["seed=1", word], folder) == name
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_folder_of_a_run_has_the_name_of_the_picture_that_it_shows(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     pixels = np.random.default_rng(0).integers(20, 255, (24, 24, 3), dtype=np.uint8)

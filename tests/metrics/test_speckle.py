@@ -1,6 +1,7 @@
 """Speckle against Goodman's closed forms, on fields whose statistics are known."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -92,12 +93,18 @@ def half_width_of_airy(level: float) -> float:
     return root(lambda x: (2 * j1(x) / x) ** 2 - level, 0.1, 3.8)
 
 
+@cache
+def square_and_round(widths: tuple[float, float]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pictures of speckle of pupils that are rectangles and ellipses of these widths."""
+    generator = np.random.default_rng(3)
+    square = tensors(*(developed((SIDE, 400), widths, generator) for _ in range(6)))
+    return square, tensors(*(developed_round((SIDE, 400), widths, generator) for _ in range(6)))
+
+
 @pytest.mark.parametrize("level", [0.5, 1 / math.e])
 @pytest.mark.parametrize("widths", [(0.25, 0.4), (0.1, 0.2)])
 def test_grain_size_is_that_of_the_pupil(widths, level):
-    generator = np.random.default_rng(3)
-    square = tensors(*(developed((SIDE, 400), widths, generator) for _ in range(6)))
-    disc = tensors(*(developed_round((SIDE, 400), widths, generator) for _ in range(6)))
+    square, disc = square_and_round(widths)
     sinc = root(lambda x: np.sinc(x) ** 2 - level, 0.1, 0.9)
     airy = half_width_of_airy(level) / math.pi
     for pictures, half in ((square, sinc), (disc, airy)):

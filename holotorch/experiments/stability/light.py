@@ -11,7 +11,15 @@ from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.experiments.stability import reference
 from holotorch.experiments.stability.sweep import ASKED, Answer, Sweep
-from holotorch.optics import Display, Eye, Retina, SpectralRetina, Spectrum
+from holotorch.optics import (
+    Display,
+    Eye,
+    SpectralRetina,
+    Spectrum,
+    plan_retina,
+    propagate_collapsed,
+    propagate_elements,
+)
 from holotorch.optics.free_space.cropped import CroppedKernel
 from holotorch.optics.light.coherence import path_difference
 from holotorch.optics.light.wavelength_sampling import least_count, neighbour_error, pupil_illumination
@@ -70,29 +78,40 @@ def _light(fwhm: float) -> tuple[Tensor, Tensor]:
     return Spectrum.lorentzian(CENTRE, fwhm).samples(EVERY)
 
 
+@lru_cache(maxsize=1)
+def _chosen(tolerance: float, fwhm: float) -> tuple[SpectralRetina, float]:
+    """The retina that propagates as many wavelengths as the tolerance requires, and the error that is predicted."""
+    wavelengths, weights = _light(fwhm)
+    count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
+    light = pupil_illumination(GRID, wavelengths.mean().item(), *OPTICS)
+    predicted = neighbour_error(wavelengths, weights, count, light)
+    return SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE), predicted
+
+
 def _propagated(tolerance: float, fwhm: float) -> Answer:
     """The image [1, H, W] with as many wavelengths propagated as the tolerance requires.
 
     The error of the propagation of each wavelength is left to ``Retina`` and is the same in the reference.
     """
-    wavelengths, weights = _light(fwhm)
-    count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
-    light = pupil_illumination(GRID, wavelengths.mean().item(), *OPTICS)
-    predicted = neighbour_error(wavelengths, weights, count, light)
-    retina = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE)
-    return Answer(retina(reference.noise_inside(GRID)), predicted, f"{count} of {EVERY} wavelengths", tolerance)
+    retina, predicted = _chosen(tolerance, fwhm)
+    chosen = f"{len(retina.chosen[0][0])} of {EVERY} wavelengths"
+    return Answer(retina(reference.noise_inside(GRID)), predicted, chosen, tolerance)
 
 
 def _each(tolerance: float, fwhm: float) -> Tensor:
-    """The same image with every wavelength propagated, in the same window, so that the pupil has the same samples."""
+    """The same image with every wavelength propagated, in the same window, so that the pupil has the same samples.
+
+    The method is chosen once: wavelengths this close differ in no choice, and a choice takes longer than an image.
+    """
     wavelengths, weights = _light(fwhm)
-    count = least_count(wavelengths, weights, tolerance, GRID, *OPTICS)
-    wide = SpectralRetina(GRID, [(wavelengths, weights)], *OPTICS, count=count, tolerance=LOOSE).wide[0]
+    wide = _chosen(tolerance, fwhm)[0].wide[0]
     y, x = ((big - small) // 2 for big, small in zip(wide.shape, GRID.shape, strict=True))
     field, total = (
         functional.pad(reference.noise_inside(GRID), (x, x, y, y)),
         torch.zeros(1, *wide.shape, dtype=torch.float64),
     )
+    method = plan_retina(wide, CENTRE, *OPTICS, tolerance=LOOSE).method
+    propagate = propagate_collapsed if method == "collapse" else propagate_elements
     for wavelength, weight in zip(wavelengths.tolist(), weights.tolist(), strict=True):
-        total += weight * Retina(wide, wavelength, *OPTICS, tolerance=LOOSE)(field)
+        total += weight * intensity(propagate(field, wide, wavelength, *OPTICS))
     return total[..., y : y + GRID.shape[0], x : x + GRID.shape[1]]

@@ -39,17 +39,19 @@ def timing(world: World, rounds: int, stream: int) -> list[Row]:
     for kind, names in tqdm((_FRAMES | {"photograph": _PHOTOGRAPH}).items(), desc="times", unit="frame"):
         name = next(name for name in names if name in scenes[0])
         frames = [(as_camera(cases[name].frame()), cases[name]) for cases in scenes]
-        calls = {method: partial(_all, track, frames) for method, track in trackers.items()}
+        poses: dict[str, list[Pose]] = {}
+        calls = {method: partial(_all, track, frames, poses, method) for method, track in trackers.items()}
         seconds = interleaved(calls, rounds)
         for method, value in seconds.items():
-            status = count_statuses(Status(pose.status) for pose in _all(trackers[method], frames))
+            status = count_statuses(Status(pose.status) for pose in poses[method])
             row: Row = {"frame": kind, "method": method, "milliseconds": round(1e3 * value / stream, 2)}
             rows.append(row | {"ratio": round(value / seconds[BASE], 3), "status": status})
     return rows
 
 
-def _all(track: Method, frames: list[tuple[Tensor, Case]]) -> list[Pose]:
-    return [track(frame, case) for frame, case in frames]
+def _all(track: Method, frames: list[tuple[Tensor, Case]], poses: dict[str, list[Pose]], method: str) -> None:
+    """Track all frames, and keep the poses of the method."""
+    poses[method] = [track(frame, case) for frame, case in frames]
 
 
 def stages(world: World, rounds: int) -> list[Row]:

@@ -1,5 +1,8 @@
 """Configurations of run folders carry a version: older ones keep their meaning, later ones are refused."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 import yaml
 
@@ -29,11 +32,18 @@ def test_an_eye_run_of_the_version_before_keeps_its_way_to_the_retina(tmp_path):
     assert load_config(path).tolerance == 0.07 and load_config(path).eye.tolerance is None
 
 
-@pytest.mark.parametrize("command", ["run", "resume", "export-heaters"])
-def test_a_later_version_is_refused_with_what_to_do(command, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Folder of a run."""
     words = ["configs/pec/fourier.yaml", "grid.shape=[24,20]", "report.baselines=[]", "solver.max_steps=2"]
-    folder = tmp_path / "a"
+    folder = tmp_path_factory.mktemp("run") / "a"
     assert main(["run", *words, "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("command", ["run", "resume", "export-heaters"])
+def test_a_later_version_is_refused_with_what_to_do(command, run, tmp_path, capsys):
+    folder = Path(shutil.copytree(run, tmp_path / "a"))
     path = folder / "config.yaml"
     text = path.read_text()
     assert text.startswith(FIRST_LINE)

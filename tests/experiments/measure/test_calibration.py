@@ -22,6 +22,7 @@ from holotorch.io.video import Frame
 from holotorch.tracking import THESIS, Catheter
 from holotorch.tracking.simulation.world import World, aimed
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 TRUE = (0.0700, 0.1085, 0.1457, 0.1836)  # metres; the file says 70, 108, 146 and 184 mm
 SIZE = (540, 960)
 

@@ -15,6 +15,7 @@ from holotorch.experiments.measure.grid import Grid, directions, need_all, visit
 from holotorch.experiments.measure.rests import Rest, Rests
 from holotorch.tracking import Pose, Status
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 SPACING = 0.0102
 TURN = np.array([[0.8, 0.36, 0.48], [0.6, -0.48, -0.64], [0.0, 0.8, -0.6]])  # right, up and normal of the sheet
 PLACE = np.array([-0.02, -0.05, 0.5])

@@ -2,10 +2,10 @@
 
 import csv
 import json
+import os
 import shutil
 import signal
-import subprocess
-import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from paths import CONFIGS
 from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
+from holotorch.experiments.pec import progress
 from holotorch.experiments.pec import run as run_module
 from holotorch.experiments.pec.progress import Log
 from holotorch.experiments.registry import load_config
@@ -24,13 +25,27 @@ from holotorch.experiments.report import write_report
 pytestmark = pytest.mark.usefixtures("tiny")
 CONFIG = CONFIGS / "pec" / "fourier.yaml"
 SMALL = ["grid.shape=[24,20]", "device=cpu", "report.baselines=[]"]
-LBFGS = "solver={kind: lbfgs, max_steps: 14}"  # 2 steps for the amplitude and 12 more
+# 2 steps for the amplitude and 12 more; the error of stopping is measured by as many further steps as the patience.
+LBFGS = "solver={kind: lbfgs, max_steps: 14, patience: 3}"
 CAPPED = [LBFGS, "modulator.max_phase=6"]  # 4 steps in the box, then penalties for 3, 3, 2 and 2
 FILES = ["arrays", "config.yaml", "env.json", "images", "metrics.csv", "plan.json", "report.html", "summary.json"]
 
 
 def settings(*overrides: str):
     return load_config(CONFIG, [*SMALL, *overrides])
+
+
+@pytest.fixture(scope="module")
+def whole(tiny, tmp_path_factory):
+    """Folder of the run with these settings that was never stopped; each is made once."""
+
+    @cache
+    def made(*overrides: str) -> Path:
+        folder = tmp_path_factory.mktemp("whole") / "run"
+        assert execute(settings(*overrides), folder)[1]
+        return folder
+
+    return made
 
 
 def press_in(monkeypatch, step: int | None) -> None:
@@ -88,11 +103,11 @@ def assert_same(folder: Path, whole: Path) -> None:
         ([*CAPPED, "frames=2"], [2, 4, 6, 9, 11, 13, 14]),
         ([LBFGS, "frames=2", "multiplexing=independent"], [2, 7]),
         ([*CAPPED, "frames=2", "multiplexing=independent", "modulator.bits=4"], [5, 12]),
-        (["solver={kind: apg, max_steps: 12}"], [1, 10, 12]),
-        (["solver={kind: apg, grow: 1.2, restart: true, max_steps: 12}", "frames=2"], [5]),
-        (["solver={kind: apg, max_steps: 12}", "frames=3", "multiplexing=independent"], [5]),
-        (["solver={kind: adam, max_steps: 12}"], [1, 7]),
-        (["solver={kind: adam, max_steps: 12}", "frames=2"], [7]),
+        (["solver={kind: apg, max_steps: 12, patience: 3}"], [1, 10, 12]),
+        (["solver={kind: apg, grow: 1.2, restart: true, max_steps: 12, patience: 3}", "frames=2"], [5]),
+        (["solver={kind: apg, max_steps: 12, patience: 3}", "frames=3", "multiplexing=independent"], [5]),
+        (["solver={kind: adam, max_steps: 12, patience: 3}"], [1, 7]),
+        (["solver={kind: adam, max_steps: 12, patience: 3}", "frames=2"], [7]),
         # Some colours stop long before the others, which must be remembered.
         (["solver={kind: lbfgs, max_steps: 40, tolerance: 0.05, patience: 2}"], [8]),
         (["propagator={kind: fresnel, distance: [20 mm, 30 mm]}", LBFGS, "frames=2"], [9]),
@@ -100,20 +115,19 @@ def assert_same(folder: Path, whole: Path) -> None:
     ],
     ids=lambda words: ",".join(map(str, words)),
 )
-def test_a_run_stopped_once_gives_the_same_bits(monkeypatch, tmp_path, capsys, overrides, steps):
-    assert execute(settings(*overrides), tmp_path / "whole")[1]
+def test_a_run_stopped_once_gives_the_same_bits(monkeypatch, tmp_path, capsys, whole, overrides, steps):
+    uninterrupted = whole(*overrides)
     for step in steps:
         folder = stopped(monkeypatch, tmp_path / str(step), step, *overrides)
         assert json.loads((folder / "interrupted.json").read_text())["status"] == "interrupted"
         capsys.readouterr()
         assert resume(folder) == 0
         assert capsys.readouterr().out.splitlines()[-1] == str(folder / "report.html")
-        assert_same(folder, tmp_path / "whole")
+        assert_same(folder, uninterrupted)
 
 
-def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path, capsys):
+def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path, capsys, whole):
     overrides = [*CAPPED, "frames=2"]
-    execute(settings(*overrides), tmp_path / "whole")
     folder = stopped(monkeypatch, tmp_path / "a", 3, *overrides)
     press_in(monkeypatch, 8)
     assert resume(folder) == 130
@@ -123,13 +137,13 @@ def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path
     assert resume(folder) == 130
     press_in(monkeypatch, None)
     assert resume(folder) == 0
-    assert_same(folder, tmp_path / "whole")
+    assert_same(folder, whole(*overrides))
 
 
 @pytest.mark.parametrize("moment", ["evaluate", "baseline", "save_picture"])
-def test_stopped_after_the_solver_is_the_same(monkeypatch, tmp_path, moment):
+def test_stopped_after_the_solver_is_the_same(monkeypatch, tmp_path, whole, moment):
     words = [LBFGS, "report.baselines=[none]"]
-    execute(settings(*words), tmp_path / "whole")
+    uninterrupted = whole(*words)
     original = getattr(run_module, moment)
 
     def pressed(*arguments, **more):
@@ -140,11 +154,10 @@ def test_stopped_after_the_solver_is_the_same(monkeypatch, tmp_path, moment):
         patch.setattr(run_module, moment, pressed)
         assert not execute(settings(*words), tmp_path / "a")[1]
     assert resume(tmp_path / "a") == 0
-    assert_same(tmp_path / "a", tmp_path / "whole")
+    assert_same(tmp_path / "a", uninterrupted)
 
 
-def test_stopped_before_anything_was_found_starts_anew(monkeypatch, tmp_path):
-    execute(settings(LBFGS), tmp_path / "whole")
+def test_stopped_before_anything_was_found_starts_anew(monkeypatch, tmp_path, whole):
     press_in(monkeypatch, 0)
     with pytest.raises(KeyboardInterrupt):
         execute(settings(LBFGS), tmp_path / "a")
@@ -153,42 +166,42 @@ def test_stopped_before_anything_was_found_starts_anew(monkeypatch, tmp_path):
     press_in(monkeypatch, None)
     assert not (tmp_path / "a" / "checkpoint.pt").exists()
     assert resume(tmp_path / "a") == 0
-    assert_same(tmp_path / "a", tmp_path / "whole")
+    assert_same(tmp_path / "a", whole(LBFGS))
 
 
-KILLED = """
-import os, signal, sys, torch
-from pathlib import Path
-from holotorch.experiments.pec import progress
-from holotorch.experiments.registry import load_config
-from holotorch.experiments.execute import execute
-torch.set_num_threads(1)
-progress._SAVE_EVERY, save, done = -1.0, torch.save, []
-def killed(content, stream):
-    done.append(stream)
-    if len(done) == 7:
-        stream.write(b"half a checkpoint")
-        stream.flush()
-        os.kill(os.getpid(), signal.SIGKILL)
-    save(content, stream)
-torch.save = killed
-execute(load_config(sys.argv[1], sys.argv[3:]), Path(sys.argv[2]))
-"""
+def killed_in_its_seventh_checkpoint(folder: Path, *overrides: str) -> int:
+    """Exit status of a process of its own that runs this, and that SIGKILL ends while it writes a checkpoint."""
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    save, done = torch.save, []
+
+    def killed(content, stream):
+        done.append(stream)
+        if len(done) == 7:
+            stream.write(b"half a checkpoint")
+            stream.flush()
+            os.kill(os.getpid(), signal.SIGKILL)
+        save(content, stream)
+
+    try:
+        progress._SAVE_EVERY, torch.save = -1.0, killed
+        execute(settings(*overrides), folder)
+    finally:
+        os._exit(1)
 
 
-def test_killed_while_it_saves_goes_on_from_the_checkpoint_before(tmp_path):
-    words, folder = [*SMALL, *CAPPED, "frames=2"], tmp_path / "a"
-    command = [sys.executable, "-c", KILLED, str(CONFIG), str(folder), *words]
-    assert subprocess.run(command, capture_output=True).returncode == -signal.SIGKILL
+def test_killed_while_it_saves_goes_on_from_the_checkpoint_before(tmp_path, whole):
+    folder = tmp_path / "a"
+    assert killed_in_its_seventh_checkpoint(folder, *CAPPED, "frames=2") == -signal.SIGKILL
     assert (folder / "checkpoint.pt").is_file()
     assert not (folder / "interrupted.json").exists() and not (folder / "summary.json").exists()
-    execute(load_config(CONFIG, words), tmp_path / "whole")
     seen = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Log, "__call__", lambda self, solution, call=Log.__call__: (seen.append(0), call(self, solution)))
         assert resume(folder) == 0
     assert len(seen) == 14 - 6  # only what was missing is computed
-    assert_same(folder, tmp_path / "whole")
+    assert_same(folder, whole(*CAPPED, "frames=2"))
 
 
 @pytest.fixture(scope="module")

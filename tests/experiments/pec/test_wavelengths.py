@@ -14,6 +14,7 @@ from holotorch.experiments.view.controls import checked
 from holotorch.experiments.view.opening import open_viewer
 from holotorch.io.colour_tables import picture_matrix
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 SMALL = ["grid.shape=[24,20]", "target.image=coffee", "solver.max_steps=20", "report.baselines=[none]"]
 SHARES = {
     "630nm,450nm": [[0.5, 0.5, 0], [0, 0.5, 0.5]],

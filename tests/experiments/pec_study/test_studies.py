@@ -21,9 +21,12 @@ SWEEP = {"lowpass": "[0.2]"}
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_every_study_fills_its_folder(study, tmp_path, capsys, monkeypatch):
+def test_every_study_fills_its_folder(study, tmp_path, capsys, monkeypatch, request):
+    if study not in ("reproduction", "time"):  # one of either kind of figure is drawn
+        request.getfixturevalue("undrawn")
     monkeypatch.setattr(pec_studies, "SIZES", (16, 32))
     monkeypatch.setattr(pec_studies, "DRAWS", 1)
+    monkeypatch.setattr(pec_studies, "ROUNDS", 2)
     monkeypatch.setattr(pec_bench, "PASSES", 3)
     words = [f"configs/pec/studies/{study}.yaml", "images=[camera,coffee]", "size=24", "max_steps=6"]
     words.append(f"sweep={SWEEP.get(study, '[0.66]')}")
@@ -53,7 +56,7 @@ def test_check_says_what_a_study_does(study, capsys):
 
 
 def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(chart_pec, "FULL", Amount({0.66: (0.3, 0.6)}, size=32, steps=24))
+    monkeypatch.setattr(chart_pec, "FULL", Amount({0.66: (0.3, 0.6)}, size=32, steps=24, runs=1))
     goals = tmp_path / "goals.yaml"
     monkeypatch.setattr(chart_pec, "GOALS", goals)
     goals.write_text("solver: {0.66: {evaluations: 0.01, seconds: 0.0001}}\ntables: {}\n")

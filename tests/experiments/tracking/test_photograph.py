@@ -11,7 +11,7 @@ import torch
 from holotorch.cli import main
 from holotorch.experiments.tracking.devices import build_catheter, load_catheter, save_camera, save_catheter
 from holotorch.experiments.tracking.forecast import range_text, working_range
-from holotorch.tracking import Catheter, CatheterTracker, ChannelOrder
+from holotorch.tracking import Camera, Catheter, CatheterTracker, ChannelOrder
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
 EDGES = (0.070, 0.108, 0.146, 0.184)
@@ -118,12 +118,19 @@ TOOLS = {
 }
 
 
+def middle(world: World) -> Camera:
+    """The camera of a world whose frames are cut to the middle ``SIZE`` pixels."""
+    matrix = world.camera.matrix.clone()
+    matrix[:2, 2] -= torch.tensor([(whole - part) / 2 for whole, part in zip(world.size, SIZE, strict=True)]).flip(0)
+    return Camera(matrix, world.camera.distortion, world.camera.tone)
+
+
 @pytest.mark.parametrize("name", TOOLS)
 def test_the_forecast_distance_is_where_tracking_ends(name):
     """Three frames nearer than the forecast are all answered, and three much farther are not all answered."""
     band, first, radius, reason = TOOLS[name]
     tool = Catheter(tuple(first + band * i for i in range(4)), World().catheter.colours, radius, 0.35)
-    world = World(catheter=tool)
+    world = World(SIZE, middle(World()), tool)
     distance, why = working_range(world.camera, tool)
     assert why == reason
     tracker = CatheterTracker(world.camera, tool, channels=ChannelOrder.RGB)

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -24,7 +25,9 @@ from holotorch.tracking.simulation.varied import VariedWorld
 from holotorch.tracking.simulation.world import World, aimed
 
 TILT = math.radians(20)
-SMALL = Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, placed=1, stream=2, repeats=1, share=0.06)
+# Each pose of ``STILL`` at rest, and one of them at another point.
+AT_REST = (("tip", (520, 20)), ("tip", (520, 5)), ("middle of the bands", (520, 20)))
+SMALL = Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, placed=1, resting=AT_REST, stream=2, repeats=1, share=0.04)
 
 
 def small(**changes) -> World:
@@ -37,6 +40,7 @@ def small(**changes) -> World:
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_tracking, "scene", lambda _: small())
     monkeypatch.setattr(chart_tracking, "FULL", SMALL)
+    monkeypatch.setattr(chart_tracking, "VariedWorld", partial(VariedWorld, size=(540, 960)))
     for module in (chart_tracking, tracking_bench):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
     monkeypatch.setattr(tracking_bench, "tip_bounds", lambda *_: Bounds(1e-9 * torch.eye(3), 2e-9 * torch.eye(3)))

@@ -1,15 +1,18 @@
 """The catheter in photographs: what is measured of their pixels, and what is changed in them."""
 
 import math
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from scipy.spatial import KDTree
 
 from holotorch.experiments.tracking_benchmark.real_pixels import real_pixels, shared_photographs
 from holotorch.tracking.pose.catheter import THESIS
 from holotorch.tracking.simulation.photographs import Photograph, drawn_photograph, measure, rendered
 
+board = cache(drawn_photograph)  # drawing it takes longer than what is done with it; nobody changes it
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "calibration"
 
 
@@ -28,7 +31,7 @@ def test_blur_noise_and_white_of_a_drawn_board(blur, shot, read):
 
 
 def test_only_the_pixels_of_the_catheter_change():
-    photograph = drawn_photograph()
+    photograph = board()
     case = rendered(photograph, measure(photograph), seed=1)
     assert case.tip is not None and case.direction is not None
     frame = case.frame()
@@ -36,13 +39,13 @@ def test_only_the_pixels_of_the_catheter_change():
     along = torch.linspace(0, THESIS.length, 400, dtype=torch.float64)[:, None]
     axis = photograph.camera.project(case.tip + along * case.direction)
     y, x = torch.meshgrid(torch.arange(480.0), torch.arange(640.0), indexing="ij")
-    away = torch.cdist(torch.stack([x, y], -1).reshape(-1, 2).double(), axis).amin(-1).reshape(480, 640)
+    away = torch.from_numpy(KDTree(axis).query(torch.stack([x, y], -1).double())[0])
     changed = (frame != photograph.frame).any(0)
     assert not changed[away > 15].any() and changed[away < 1].float().mean() > 0.9
 
 
 def test_a_grey_photograph_without_a_board_is_measured_too():
-    drawn = drawn_photograph()
+    drawn = board()
     grey = Photograph("grey", drawn.frame[:1].expand(3, -1, -1), drawn.camera, None)
     pixels = measure(grey)
     assert grey.grey and math.isnan(pixels.blur_px) and len(set(pixels.white)) == 1
@@ -50,7 +53,7 @@ def test_a_grey_photograph_without_a_board_is_measured_too():
 
 
 def test_rows_sheet_and_lines():
-    rows, sheet, lines = real_pixels([drawn_photograph()], 2)
+    rows, sheet, lines = real_pixels([board()], 2)
     assert {row["method"] for row in rows} == {"thesis, OpenCV", "ours, cold", "ours, cold, photometric fit"}
     for row in rows:
         assert row["right"] + row["wrong"] + row["refused"] == row["frames"] == 2 and row["wrong"] == 0

@@ -14,6 +14,7 @@ from holotorch.experiments.view.controls import checked
 from holotorch.experiments.view.opening import open_viewer
 from holotorch.io.colour_tables import picture_matrix, srgb_matrix
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 TINY = [
     "volume={phantom: shells, samples: 24}",
     "transfer={points: [[20, 1, 0.2, 0, 0], [120, 1, 0.6, 0.2, 0.3], [255, 0.2, 0.9, 1, 0.9]], unit_distance: 0.05}",

@@ -74,6 +74,7 @@ def test_the_map_of_depths_says_what_it_is_of(tmp_path, monkeypatch, tiny):
     assert labels == ["mean depth behind the hologram (mm)"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_more_realisations_have_less_speckle(tmp_path):
     execute(settings("report.seeds=8"), tmp_path / "a", "a")
     with open(tmp_path / "a" / "metrics.csv", newline="") as stream:
@@ -93,6 +94,7 @@ def press_in(monkeypatch, realisation: int | None):
     monkeypatch.setattr(volume_run.VolumeExperiment, "hologram", pressed)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_interrupted_and_resumed_is_the_same_to_the_bit(tmp_path, monkeypatch, capsys):
     execute(settings("report.seeds=3"), tmp_path / "whole", "a")
     with monkeypatch.context() as patch:
@@ -113,6 +115,7 @@ def test_interrupted_and_resumed_is_the_same_to_the_bit(tmp_path, monkeypatch, c
     assert main(["resume", str(tmp_path / "b")]) == 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_interruption_while_errors_are_measured_leaves_them_to_resuming(tmp_path, monkeypatch):
     (tmp_path / "a").mkdir()
     with monkeypatch.context() as patch:
