@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -33,6 +34,22 @@ def start_apart(
     process = _CONTEXT.Process(target=_run, args=(job, words, said, {**os.environ, **(env or {})}))
     process.start()
     return process
+
+
+def printed_by(code: str, folder: Path, *, strict: bool = False) -> str:
+    """What ``code`` prints when a process of its own runs it in ``folder``; with ``strict``, a warning is an error."""
+    said = folder / "said.txt"
+    process = start_apart(_execute, code, str(folder), strict, said=said)
+    process.join()
+    assert process.exitcode == 0, said.read_text()
+    return said.read_text()
+
+
+def _execute(code: str, folder: str, strict: bool) -> None:
+    os.chdir(folder)
+    if strict:
+        warnings.simplefilter("error")
+    exec(code, {"__name__": "__main__"})
 
 
 def _run(job: Callable[..., Any], words: tuple[Any, ...], said: Path | None, env: dict[str, str]) -> None:

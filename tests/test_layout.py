@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from apart import printed_by
 from paths import ROOT
 
 PACKAGE = ROOT / "holotorch"
@@ -146,18 +147,18 @@ def test_readme_example_runs_and_is_short():
 def test_further_readme_examples_run(tmp_path):
     """Drawing a propagated field, and a gradient from retina to heater."""
     draw, train = blocks("python", ROOT / "README.md")[1:]
-    subprocess.run([sys.executable, "-c", draw], check=True, cwd=tmp_path)
+    printed_by(draw, tmp_path)
     assert (tmp_path / "beam.png").stat().st_size > 10_000
-    done = subprocess.run([sys.executable, "-c", train], check=True, capture_output=True, text=True)
-    assert float(done.stdout.split()[-1]) < 0.02, done.stdout
+    said = printed_by(train, tmp_path)
+    assert float(said.split()[-1]) < 0.02, said
     assert len(train.splitlines()) <= 30
 
 
-def test_readme_example_of_tracking_runs():
+def test_readme_example_of_tracking_runs(tmp_path):
     code = blocks("python", ROOT / "scripts" / "docs" / "tracking.md")[0]
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    status, off = re.findall(r"^(\w+) ([\d.]+) mm off", done.stdout)[0]
-    assert status == "OK" and float(off) < 0.5, done.stderr
+    said = printed_by(code, tmp_path)
+    status, off = re.findall(r"^(\w+) ([\d.]+) mm off", said, re.M)[0]
+    assert status == "OK" and float(off) < 0.5, said
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *GUIDE], ids=lambda page: page.name)
