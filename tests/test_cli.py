@@ -11,9 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from apart import start_apart
 from paths import CONFIGS
 
 from holotorch.cli import main
+from holotorch.experiments import demo
 
 CONFIG = str(CONFIGS / "pec" / "fourier.yaml")
 TINY = ["grid.shape=[16,16]", "solver.max_steps=2"]
@@ -73,7 +75,20 @@ def test_report_of_several_runs(capsys):
     assert Path("report.html").is_file()
 
 
-def test_demo_runs_on_bundled_data(capsys):
+SMALL_DEMO = {
+    "demo": ["grid.shape=[32,48]", "solver.max_steps=20"],
+    "demo_volume": [
+        "volume={phantom: c60, samples: 32}",
+        "hologram={shape: [128, 128], pitch: 3.74 um, distance: 7.5 mm, depths: 12, rays: 64}",
+        "report.seeds=1",
+    ],
+}
+
+
+def test_demo_runs_on_bundled_data(capsys, monkeypatch):
+    load = demo.load_config
+    smaller = lambda path, words: load(path, [*words, *SMALL_DEMO.get(Path(path).stem, [])])  # noqa: E731
+    monkeypatch.setattr(demo, "load_config", smaller)
     assert main(["demo", "--out", "here"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "here/report.html"
     page = Path("here/report.html").read_text()
@@ -183,18 +198,21 @@ def test_check_says_when_a_run_will_not_fit(capsys):
     assert "GB of memory at the peak" in captured.out and "the run needs about" in captured.err
 
 
+def end_with(words: list[str]) -> None:
+    sys.exit(main(words))
+
+
 def test_ctrl_c_exits_130_and_saves(tmp_path):
     """The real signal, sent to a real process in the middle of its work."""
-    words = [sys.executable, "-m", "holotorch", "run", CONFIG, "solver.max_steps=100000", "solver.tolerance=0"]
-    process = subprocess.Popen([*words, "--out", "cut"], stderr=subprocess.PIPE, bufsize=0)
-    assert process.stderr is not None
-    os.set_blocking(process.stderr.fileno(), False)
-    seen, deadline = b"", time.monotonic() + 120
-    while b"ssim=" not in seen and time.monotonic() < deadline:
-        seen += process.stderr.read() or b""
+    words = ["run", CONFIG, "grid.shape=[16,16]", "solver.max_steps=100000", "solver.tolerance=0", "--out", "cut"]
+    said = tmp_path / "said"
+    process, deadline = start_apart(end_with, words, said=said), time.monotonic() + 120
+    while not (said.exists() and b"ssim=" in said.read_bytes()) and time.monotonic() < deadline:
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(120) == 130
+    assert process.pid
+    os.kill(process.pid, signal.SIGINT)
+    process.join(120)
+    assert process.exitcode == 130, said.read_text()[-2000:]
     assert (tmp_path / "cut" / "interrupted.json").is_file() and not (tmp_path / "cut" / "summary.json").exists()
     phase = np.load(tmp_path / "cut" / "arrays" / "phase.npy")
     assert np.isfinite(phase).all() and phase.max() > 0

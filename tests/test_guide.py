@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from apart import printed_by
 from paths import ROOT
 
 BUILD = ROOT / "scripts" / "docs" / "build.py"
@@ -31,22 +32,19 @@ class Links(HTMLParser):
             self.loads.append(source)
 
 
-def printed(page: str) -> str:
-    """What the Python of a page about a task prints."""
+def printed(page: str, folder: Path) -> str:
+    """What the Python of a page about a task prints, run in ``folder``."""
     text = (BUILD.parent / "tasks" / page).read_text(encoding="utf-8")
-    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.S))
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return printed_by("\n".join(re.findall(r"```python\n(.*?)```", text, re.S)), folder, strict=True)
 
 
-def test_the_numbers_of_a_design_are_those_on_its_page():
-    text = printed("design_a_display.md")
+def test_the_numbers_of_a_design_are_those_on_its_page(tmp_path):
+    text = printed("design_a_display.md", tmp_path)
     assert [each for each in ("7.97 deg", "10.94 deg", "at 0.36 m", "93.3 mm", "10 nm") if each not in text] == []
 
 
-def test_the_network_of_its_page_learns():
-    losses = [float(line.split()[1]) for line in printed("train_with_it.md").splitlines()]
+def test_the_network_of_its_page_learns(tmp_path):
+    losses = [float(line.split()[1]) for line in printed("train_with_it.md", tmp_path).splitlines()]
     assert losses[-1] < 0.6 * losses[0]
 
 

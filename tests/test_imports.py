@@ -4,6 +4,8 @@ import ast
 import re
 import tomllib
 from collections import Counter, defaultdict
+from dataclasses import dataclass
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -45,6 +47,17 @@ IMPORTED_AS = {
 }
 
 
+@dataclass(frozen=True)
+class Source:
+    """What the tests ask of a file: the modules that it imports, in functions too, and its functions of 80 lines.
+
+    Of imports, those that only type checkers see are left out.
+    """
+
+    imported: set[str]
+    long: tuple[str, ...]
+
+
 def module_of(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -53,12 +66,14 @@ def module_of(path: Path) -> str:
 MODULES = {module_of(path): path for path in FILES}
 
 
-def imported(path: Path) -> set[str]:
-    """All modules that a file imports, in functions too, and not those that only type checkers see."""
-    found: set[str] = set()
+@cache
+def source(path: Path) -> Source:
+    found, long = set[str](), list[str]()
     pending: list[ast.AST] = [ast.parse(path.read_text())]
     while pending:
         node = pending.pop()
+        if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - node.lineno >= 80:
+            long.append(f"{path.relative_to(PACKAGE)}: {node.name}")
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             pending += node.orelse
             continue
@@ -70,10 +85,10 @@ def imported(path: Path) -> set[str]:
             if not inner <= MODULES.keys():
                 found.add(node.module)
         pending += ast.iter_child_nodes(node)
-    return found
+    return Source(found, tuple(long))
 
 
-GRAPH = {module: imported(path) & MODULES.keys() - {module} for module, path in MODULES.items()}
+GRAPH = {module: source(path).imported & MODULES.keys() - {module} for module, path in MODULES.items()}
 
 
 def folder_of(module: str) -> str:
@@ -139,15 +154,12 @@ def test_declared_dependencies_are_imported(group):
     listed = project["optional-dependencies"][group] if group else project["dependencies"]
     sources = [*FILES, ROOT / "scripts" / "bench.py"] if group == "bench" else FILES
     text = "".join(path.read_text() for path in FILES)
-    everything = {name.split(".")[0] for path in sources for name in imported(path)}
+    everything = {name.split(".")[0] for path in sources for name in source(path).imported}
     for requirement in listed:
         name = re.split(r"[<>=~!;\[ ]", requirement)[0].lower()
         optional = f'"{name}"' in text  # by its name, where it is installed
         assert IMPORTED_AS.get(name, name) in everything or optional, requirement
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_a_function_fits_on_a_screen(path: Path):
-    functions = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
-    long = [node.name for node in functions if (node.end_lineno or 0) - node.lineno >= 80]
-    assert not long, f"more than 80 lines: {', '.join(long)}"
+def test_a_function_fits_on_a_screen():
+    assert [name for path in FILES for name in source(path).long] == []

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import multiprocessing
+from apart import start_apart
 
 
 def run_in_two_processes(job: Callable[[int], Any], path: Path) -> Any:
@@ -16,9 +16,13 @@ def run_in_two_processes(job: Callable[[int], Any], path: Path) -> Any:
 
     Args:
         job: A function of a module, since the processes import it.
-        path: Folder for the file by which the processes meet and for the result.
+        path: Folder for the file by which the processes meet, for what they say, and for the result.
     """
-    multiprocessing.spawn(_process, (job, str(path)), nprocs=2)  # type: ignore[attr-defined]
+    pair = [start_apart(_process, rank, job, str(path), said=path / f"said.{rank}") for rank in range(2)]
+    for process in pair:
+        process.join(120)
+    said = "\n".join((path / f"said.{rank}").read_text() for rank in range(2))
+    assert [process.exitcode for process in pair] == [0, 0], said
     return torch.load(path / "result.pt")
 
 

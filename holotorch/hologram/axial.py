@@ -201,7 +201,6 @@ class AxialHologram(LayerHologram):
         return out
 
 
-@torch.compiler.assume_constant_result
 def _keep_design(operator: AxialHologram, shape: tuple[int, int], *, warn: bool = False) -> None:
     """Have the design for ``shape`` in ``operator``; computed when torch.compile traces, which cannot follow NumPy."""
     if shape not in operator._designs:
@@ -214,6 +213,10 @@ def _keep_design(operator: AxialHologram, shape: tuple[int, int], *, warn: bool 
             checks.SamplingWarning,
             stacklevel=3,
         )
+
+
+# What torch.compiler.assume_constant_result does, which loads all of torch's compiler first, for two seconds.
+_keep_design._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 class Accumulator:

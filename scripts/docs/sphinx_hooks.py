@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from functools import lru_cache
 from importlib import import_module
 from inspect import isroutine
 from pathlib import Path
@@ -72,6 +73,12 @@ def shorten_defaults(
 
 def documented(env: BuildEnvironment) -> dict[str, list[tuple[str, str]]]:
     """Page and anchor of every documented object, by its full name and by the last part (of methods: two parts)."""
+    return _documented(env, len(env.domains.python_domain.objects))
+
+
+@lru_cache(maxsize=1)  # every reference asks for it
+def _documented(env: BuildEnvironment, count: int) -> dict[str, list[tuple[str, str]]]:
+    """:func:`documented` for ``count`` objects."""
     places: dict[str, list[tuple[str, str]]] = {}
     for name, entry in env.domains.python_domain.objects.items():
         parts = 2 if entry.objtype in ("method", "attribute", "property") else 1

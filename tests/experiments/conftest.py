@@ -1,21 +1,18 @@
 import pytest
 import torch
 from stand_in import CAMERA, SIZE, StandIn
+from undrawn import without_figures
 
-from holotorch.experiments.runs import figures
 from holotorch.experiments.tracking import source as track_source
 from holotorch.experiments.tracking.devices import save_camera, save_catheter
 from holotorch.tracking import THESIS
 
 
-class Blank:
-    """A canvas that draws nothing."""
-
-    def __init__(self, figure):
-        pass
-
-    def print_png(self, buffer):
-        """Leave the picture empty."""
+@pytest.fixture
+def no_figures():
+    """For runs whose figures another test has drawn, or the same run before."""
+    with without_figures():
+        yield
 
 
 @pytest.fixture
@@ -29,10 +26,7 @@ def tiny():
     """For tiny runs: no figures, which take longer than they do, and one thread, as two would wait for each other."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("comparison", "channel_maps", "convergence", "picture_table", "visual_field"):
-            patch.setattr(figures, name, lambda *_, **__: b"")
-        patch.setattr(figures, "FigureCanvasAgg", Blank)
+    with without_figures():
         yield
     torch.set_num_threads(threads)
 

@@ -46,6 +46,7 @@ def wanted(kind: str, summary: dict) -> list[str]:
     ]
 
 
+@pytest.mark.usefixtures("tiny")
 @pytest.mark.parametrize("kind", RUNS)
 def test_a_run_ends_with_its_main_numbers_its_pictures_and_its_report(kind, tmp_path, capsys):
     folder = tmp_path / "a"

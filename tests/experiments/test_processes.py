@@ -7,14 +7,17 @@ import re
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import several_runs
 import torch
+from apart import start_apart
 from paths import CONFIGS
+from tiny_runs import EYE as SMALL_EYE
 from tiny_runs import RUNS, without
 from two_processes import run_in_two_processes
 
@@ -31,22 +34,21 @@ VOLUME = [
     "hologram={shape: [64, 64], pitch: 3.74 um, distance: 3 mm, depths: 12, rays: 32}",
 ]
 EYE = [
-    str(CONFIGS / "eye" / "teapot.yaml"),
-    "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 32}', "
-    "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 12 mm, depths: 8, rays: 32}']}",
-    "light={sources: [laser, led]}",
-    "focus=[11.9 mm, 12 mm]",
-    "tolerance=0.2",
+    *(str(CONFIGS / "eye" / "teapot.yaml"), *SMALL_EYE, "tolerance=0.2"),
+    *("light={sources: [laser, led]}", "focus=[2 mm, 2.1 mm]"),
 ]
 PEC = [str(CONFIGS / "pec" / "fourier.yaml"), "grid.shape=[24,20]", "device=cpu"]
-FRAMES = [str(CONFIGS / "pec" / "capped.yaml"), *PEC[1:], "frames=3", "solver.max_steps=8"]
+FRAMES = [
+    *(str(CONFIGS / "pec" / "capped.yaml"), *PEC[1:]),
+    *("frames=3", "solver.max_steps=8", "report.baselines=[none, basic_ipec, chopping]"),
+]
 WEIGHTED = [str(CONFIGS / "pec" / "peripheral.yaml"), *PEC[1:], "solver.max_steps=8"]
 JOINT = [str(CONFIGS / RUNS["joint"][0]), *RUNS["joint"][1:]]
 COLOURS = [*JOINT, "frames=1", "display.planes=1", "report.baselines=[unheated]"]
 HEATED = [*JOINT, "heat={frame_us: 20, time_constant_us: 10}", "report.baselines=[afterwards, slabs]"]
 SAMPLED = [*JOINT, "eye={parallax: 4, per_step: 2}", "report.baselines=[unheated, light_field]"]
 SHARED = {
-    "volume": ([*VOLUME, "device=cpu"], ["hologram", "refocused"]),
+    "volume": ([*VOLUME, "device=cpu", "report.seeds=4"], ["hologram", "refocused"]),
     "eye": ([*EYE, "seeds=1"], ["retina", "reference"]),
     "pec, colours": ([*PEC, "solver={kind: lbfgs, max_steps: 8}", "solver.reruns=1"], ["phase", "intensity"]),
     "pec, frames": (FRAMES, ["phase", "intensity"]),
@@ -55,45 +57,65 @@ SHARED = {
     "joint, frames": (HEATED, ["phase", "shown"]),
     "joint, random views": (SAMPLED, ["phase", "shown"]),
 }
-STEPS = {  # long enough to be interrupted
-    "pec": [*PEC, "solver.max_steps=400", "solver.patience=400", "report.baselines=[]"],
-    "joint": [*JOINT, "steps=100", "report.baselines=[slabs]"],
+STEPS = {
+    "pec": [*PEC, "solver.max_steps=16", "solver.patience=16", "report.baselines=[]"],
+    "joint": [*JOINT, "steps=16", "report.baselines=[slabs]"],
 }
+KILLED_VOLUME = 3  # the sum of the third realisation, before which that of the first is saved
+KILLED_STEP = 20  # a sum in the sixth step or later: a step takes two or three
 
 
-def started(*words: str) -> "subprocess.Popen[str]":
-    """Two processes that run a script or a module."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *words],
+@dataclass(frozen=True)
+class Job:
+    """What two processes of torchrun have left and said; the last run is cut off, since one of them is killed."""
+
+    folder: Path
+    said: str
+    status: int
+
+
+@pytest.fixture(scope="module")
+def by_two(tmp_path_factory) -> Job:
+    """The run of each kind in ``SHARED``, and that of the volume again in which a process is killed, by one pair."""
+    folder = tmp_path_factory.mktemp("two")
+    runs = [["run", *words, "--out", str(folder / kind)] for kind, (words, _) in SHARED.items()]
+    last = ["run", *SHARED["volume"][0], "--out", str(folder / "killed")]
+    (folder / "runs.json").write_text(json.dumps({"runs": runs, "last": last, "killed_at": KILLED_VOLUME}))
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"),
+            *(str(Path(several_runs.__file__)), str(folder / "runs.json")),
+        ],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
+    for kind in SHARED:
+        assert done.stdout.count(f"status 0 of {folder / kind}\n") == 2, done.stdout[-2000:]
+        assert done.stdout.count(f"{folder / kind / 'report.html'}\n") == 1, done.stdout[-2000:]
+    assert done.stdout.rpartition("status 0 of")[0].count("Result     ") == len(SHARED)
+    assert "\n.\n" not in done.stdout and os.devnull not in done.stdout
+    return Job(folder, done.stdout, done.returncode)
 
 
 @pytest.fixture(scope="module")
-def run_by_two(tmp_path_factory) -> Path:
-    """Folder with the run of each kind in ``SHARED``, all by one pair of processes."""
-    folder = tmp_path_factory.mktemp("two")
-    runs = [["run", *words, "--out", str(folder / kind)] for kind, (words, _) in SHARED.items()]
-    (folder / "runs.json").write_text(json.dumps(runs))
-    job = started(str(Path(several_runs.__file__)), str(folder / "runs.json"))
-    text = job.communicate()[0]
-    assert job.returncode == 0, text[-2000:]
-    for kind in SHARED:
-        assert text.count(f"status 0 of {folder / kind}\n") == 2, text[-2000:]
-        assert text.count(f"{folder / kind / 'report.html'}\n") == 1, text[-2000:]
-    assert text.count("Result     ") == len(SHARED) and "\n.\n" not in text and os.devnull not in text
-    return folder
+def by_one(tiny, tmp_path_factory) -> Callable[[str], Path]:
+    """Folder with the run of a kind in ``SHARED`` by one process, done when asked for."""
+    place = tmp_path_factory.mktemp("one")
+
+    def of(kind: str) -> Path:
+        if not (place / kind).is_dir():
+            assert main(["run", *SHARED[kind][0], "--out", str(place / kind)]) == 0
+        return place / kind
+
+    return of
 
 
 @pytest.mark.parametrize("kind", SHARED)
-def test_several_processes_give_what_one_gives(kind, run_by_two, tmp_path):
-    words, arrays = SHARED[kind]
-    folders = tmp_path / "one", run_by_two / kind
-    assert main(["run", *words, "--out", str(folders[0])]) == 0
-    for name in arrays:
+def test_several_processes_give_what_one_gives(kind, by_two, by_one):
+    folders = by_one(kind), by_two.folder / kind
+    for name in SHARED[kind][1]:
         one, two = (np.load(folder / "arrays" / f"{name}.npy") for folder in folders)
         assert np.linalg.norm(one - two) < 1e-6 * np.linalg.norm(one)
     one, two = (json.loads((folder / "summary.json").read_text()) for folder in folders)
@@ -109,37 +131,28 @@ def nearly(value):
     return value if value is None or isinstance(value, str | bool) else pytest.approx(value, rel=1e-4, abs=1e-6)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_a_killed_process_is_reported_and_the_run_goes_on_where_it_was(tmp_path):
-    out, words = tmp_path / "run", [*VOLUME, "device=cpu", "report.seeds=100"]
-    job = started("-m", "holotorch", "run", *words, "--out", str(out))
-    while not (out / "checkpoint.pt").is_file():
-        assert job.poll() is None, job.communicate()[0][-2000:]
-        time.sleep(0.05)
-    (helper,) = [pid for pid in workers(job.pid) if b"RANK=1" in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")]
-    os.kill(helper, signal.SIGKILL)
-    text = job.communicate(timeout=120)[0]
-    assert job.returncode == 1 and f"go on with: holotorch resume {out}" in text
-    assert "another process of this run has ended" in text or "interrupted" in text
+def test_a_killed_process_is_reported_and_the_run_goes_on_where_it_was(by_two, by_one):
+    out = by_two.folder / "killed"
+    assert by_two.status == 1 and f"go on with: holotorch resume {out}" in by_two.said
+    assert "another process of this run has ended" in by_two.said or "interrupted" in by_two.said
+    assert (out / "checkpoint.pt").is_file()
     assert main(["resume", str(out)]) == 0 and not (out / "checkpoint.pt").exists()
-    assert main(["run", *words, "--out", str(tmp_path / "whole")]) == 0
-    one, other = (np.load(folder / "arrays" / "refocused.npy") for folder in (out, tmp_path / "whole"))
+    one, other = (np.load(folder / "arrays" / "refocused.npy") for folder in (out, by_one("volume")))
     assert np.linalg.norm(one - other) < 1e-6 * np.linalg.norm(other)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 @pytest.mark.parametrize("kind", STEPS)
-def test_a_solver_goes_on_where_another_process_was_killed(kind, tmp_path):
-    out, words = tmp_path / "run", STEPS[kind]
-    job, text = started("-m", "holotorch", "run", *words, "--out", str(out)), ""
-    assert job.stdout
-    while not re.search(r"\| [1-9]\d*/\d+ \[", text):  # the first steps in the progress bar
-        text += (more := job.stdout.read(1))
-        assert more, text[-2000:]
-    (helper,) = [pid for pid in workers(job.pid) if b"RANK=1" in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")]
-    os.kill(helper, signal.SIGKILL)
-    text += job.communicate(timeout=120)[0]
-    assert job.returncode == 1 and f"with: holotorch resume {out}" in text, text[-2000:]
+def test_a_solver_goes_on_where_another_process_was_killed(kind, tiny, tmp_path):
+    out, words, places = tmp_path / "run", STEPS[kind], [{"RANK": f"{rank}", "WORLD_SIZE": "2"} for rank in range(2)]
+    asked = ["run", *words, "--out", str(out)], tmp_path / "meeting", KILLED_STEP
+    pair = [
+        start_apart(several_runs.run_until_killed, *asked, said=tmp_path / place["RANK"], env=place) for place in places
+    ]
+    for process in pair:
+        process.join(120)
+    text = (tmp_path / "0").read_text()
+    assert [process.exitcode for process in pair] == [1, -signal.SIGKILL], text[-2000:]
+    assert f"with: holotorch resume {out}" in text and re.search(r"\| [1-9]\d*/16 \[", text), text[-2000:]
     assert "another process of this run has ended" in text or "interrupted" in text
     assert (out / "checkpoint.pt").is_file()
     assert main(["resume", str(out)]) == 0 and not (out / "checkpoint.pt").exists()
@@ -189,8 +202,3 @@ def test_each_process_of_a_machine_has_a_gpu_of_its_own(monkeypatch):
         monkeypatch.setenv("LOCAL_RANK", local_rank)
         assert find_device("auto") == torch.device("cuda") and find_device("cpu") == torch.device("cpu")
     assert chosen == [0, 3, 1]
-
-
-def workers(parent: int) -> list[int]:
-    """Processes that a process has started."""
-    return [int(pid) for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]

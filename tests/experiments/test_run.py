@@ -124,6 +124,7 @@ def test_every_kind_runs_and_improves_on_its_baselines(overrides, tmp_path):
             assert methods["corrected"]["psnr_mean"] > numbers["psnr_mean"]
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(finished, tmp_path):
     execute(settings(), tmp_path / "b")
     execute(settings("pec/fourier.yaml", "seed=8"), tmp_path / "c")
@@ -131,6 +132,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(finished, tmp_pa
     assert np.array_equal(a, b) and not np.array_equal(a, c)
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_the_resolved_configuration_repeats_the_run(finished, tmp_path):
     execute(load_config(finished / "config.yaml"), tmp_path / "again")
     assert np.array_equal(
@@ -183,6 +185,7 @@ def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("moment", ["evaluate", "save_array", "save_picture", "write_report", "baseline"])
+@pytest.mark.usefixtures("no_figures")
 def test_ctrl_c_after_the_solver_loses_nothing(monkeypatch, tmp_path, moment, number):
     where = execute_module if moment == "write_report" else run_module
     original = getattr(where, moment)

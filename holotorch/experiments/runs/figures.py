@@ -72,6 +72,7 @@ def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
         axes = figure.add_axes((left / size[0], gap / size[1], wide / size[0], tall / size[1]))
         pixels = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
         axes.imshow(pixels, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes.set(xticks=[], yticks=[])  # matplotlib lays ticks out even where the axes are off
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
     return figure_png(figure)

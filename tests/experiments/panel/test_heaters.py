@@ -26,18 +26,24 @@ def kernel(sigma: float = 0.66, size: int = 5, scale: float = 130.0) -> np.ndarr
     return scale * np.exp(-(y**2 + x**2) / sigma**2)
 
 
+@pytest.fixture(scope="module")
+def known(tmp_path_factory, tiny) -> np.ndarray:
+    """Phases of a run whose kernel is a Gaussian by its sigma."""
+    folder = tmp_path_factory.mktemp("known") / "a"
+    assert main(["run", *SMALL, "modulator={sigma_px: 0.66, kernel_size: 5}", "--out", str(folder)]) == 0
+    return np.load(folder / "arrays" / "phase.npy")
+
+
 @pytest.mark.parametrize("suffix", ["npy", "csv", "txt"])
-def test_a_measured_gaussian_gives_what_its_sigma_gives(tmp_path, suffix, capsys):
+def test_a_measured_gaussian_gives_what_its_sigma_gives(known, tmp_path, suffix, capsys):
     path = tmp_path / f"kernel.{suffix}"
     if suffix == "npy":
         np.save(path, kernel())
     else:
         np.savetxt(path, kernel(), delimiter="," if suffix == "csv" else " ", fmt="%.17g")
-    known = [*SMALL, "modulator={sigma_px: 0.66, kernel_size: 5}"]
-    assert main(["run", *known, "--out", str(tmp_path / "a")]) == 0
     assert main(["run", *SMALL, f"modulator={{kernel: {path}}}", "--out", str(tmp_path / "b")]) == 0
-    one, other = (np.load(tmp_path / name / "arrays" / "phase.npy") for name in "ab")
-    np.testing.assert_allclose(one, other, rtol=0, atol=2e-3)  # eight steps from phases of 6 rad, in float32
+    other = np.load(tmp_path / "b" / "arrays" / "phase.npy")
+    np.testing.assert_allclose(known, other, rtol=0, atol=2e-3)  # eight steps from phases of 6 rad, in float32
     plan = json.loads((tmp_path / "b" / "plan.json").read_text())["crosstalk"]
     assert plan["fitted_sigma_px"] == pytest.approx(0.66, abs=1e-3) and plan["fit_residual"] < 1e-3
     said = capsys.readouterr().out

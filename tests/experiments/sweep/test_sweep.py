@@ -10,6 +10,7 @@ import time
 
 import pytest
 from toy.kind import ToyKind
+from undrawn import without_figures
 
 from holotorch.cli import main
 from holotorch.experiments import registry
@@ -130,23 +131,31 @@ def test_a_check_says_how_many_runs_and_what_they_cost(capsys):
     assert "GB of memory for each" in out
 
 
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    """Words of a sweep, and its folder, filled by this process."""
+    folder, words = tmp_path_factory.mktemp("here"), [*PEC, "modulator.sigma_px=0.3,0.66"]
+    with without_figures():
+        assert main(["sweep", *words, "--out", str(folder)]) == 0
+    return words, folder
+
+
 @pytest.mark.parametrize(
     "engine", [["--jobs", "2"], ["--slurm", "cluster=local", "timeout_min=5"]], ids=["joblib", "jobs"]
 )
-def test_other_processes_give_what_this_one_gives(engine, tmp_path, capsys):
+def test_other_processes_give_what_this_one_gives(engine, here, tmp_path, capsys):
     if engine[0] == "--slurm":
         pytest.importorskip("submitit", reason="pip install 'holotorch[cluster]'")
-    words = [*PEC, "modulator.sigma_px=0.3,0.66"]
-    assert main(["sweep", *words, "--out", str(tmp_path / "here")]) == 0
+    words, folder = here
     assert main(["sweep", *words, "--out", str(tmp_path / "there"), *engine]) == 0
     measured = ("seconds", "memory")
     tables = [
-        [{k: v for k, v in row.items() if not any(each in k for each in measured)} for row in rows(tmp_path / name)]
-        for name in ("here", "there")
+        [{k: v for k, v in row.items() if not any(each in k for each in measured)} for row in rows(where)]
+        for where in (folder, tmp_path / "there")
     ]
     assert tables[0] == tables[1] and len(tables[0]) == 2
     for name in ("sigma_px=0.3", "sigma_px=0.66"):
-        arrays = [(tmp_path / where / name / "arrays" / "phase.npy").read_bytes() for where in ("here", "there")]
+        arrays = [(where / name / "arrays" / "phase.npy").read_bytes() for where in (folder, tmp_path / "there")]
         assert arrays[0] == arrays[1]
     assert (tmp_path / "there" / "sweep.png").is_file()
 

@@ -116,6 +116,7 @@ def test_an_icon_that_is_none_is_said(tmp_path, capsys):
         ("{field_deg: 60, arcmin: 3, name: mine}", "not at 40 deg"),
     ],
 )
+@pytest.mark.usefixtures("no_figures")
 def test_an_own_display_is_checked_before_those_of_the_table(display, wanted, tmp_path):
     assert main(["run", str(LAYOUT), f"display={display}", "--out", str(tmp_path / "a")]) == 0
     with open(tmp_path / "a" / "displays.csv", newline="") as stream:
