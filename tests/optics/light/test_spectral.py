@@ -106,7 +106,7 @@ def test_a_neighbour_equals_the_wavelength_itself(elements, paraxial):
 @pytest.mark.parametrize("elements", [True, False])
 def test_the_errors_of_the_eye_are_those_of_each_wavelength(elements):
     """Half a wave of defocus and coma, and the colour error that the eye has besides."""
-    grid, display = Grid((72, 64), 12e-6), Display.planar(80e-3)
+    grid, display = Grid((72, 64), 10e-6), Display.planar(80e-3)
     eye = Eye(1e-3, 24e-3, 60e-3, {4: 0.2e-6, 8: 0.1e-6}, chromatic_reference=GREEN, softness=60e-6)
     field, way, other = (
         random_phase(grid, torch.complex64)[None],
