@@ -156,6 +156,19 @@ def test_compiles_without_graph_breaks(case: Case):
     assert relative(got, wanted) <= EXACT
 
 
+def test_a_compiled_operator_does_not_compute_its_kernel_in_each_call():
+    operations = []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]):
+        operations.extend(node.target for node in graph.graph.nodes)
+        return graph.forward
+
+    torch.compiler.reset()
+    x = torch.ones(len(WAVELENGTHS), *GRID.shape, dtype=torch.complex128)
+    torch.compile(Fresnel(GRID, WAVELENGTHS, 50e-6, pad=2), fullgraph=True, backend=backend)(x)
+    assert operations and torch.cos not in operations
+
+
 @pytest.mark.parametrize("case", [case for case in EVERYWHERE if case.unitary], ids=lambda case: case.name)
 def test_unitary_operators_keep_power_and_are_undone_by_their_adjoint(case: Case):
     operator, x = case.build(), case.input()

@@ -52,7 +52,8 @@ def test_a_quarter_of_the_wavelengths_gives_the_sum_over_every_nanometre(preset,
 def test_the_error_is_foreseen(preset):
     """From above: light is taken to be at a hard rim evenly, and all errors to be seen in a picture without speckle."""
     grid, eye = Grid(256, PITCH), Eye(0.5e-3, 24e-3, 120e-3, softness=20e-6)
-    places, weights = preset(GREEN).every(1e-9)
+    spectrum = preset(GREEN)
+    places, weights = spectrum.every(spectrum.fwhm / 5)
     light, field = pupil_illumination(grid, GREEN, DISPLAY, eye), random_phase(grid, torch.complex64)
     assert 0.3 < light.edge < 0.5
     wanted = spectral_image(field, grid, places, weights, DISPLAY, eye, count=len(places))
