@@ -20,7 +20,7 @@ from holotorch.tracking.pose.catheter import Catheter
 _SAMPLES = 256  # rays of a pixel near the bands: the standard deviation of their levels is then 0.6
 _FEW = 32  # rays of a pixel near the rest of the catheter
 _BESIDE = 0.015  # metres beyond the bands with many rays
-_CHUNK = 4096  # pixels whose rays are drawn at a time
+_CHUNK = 4096  # pixels that share well-spread points
 _BLOCK = 1 << 15  # rays traced at a time: with all that follows from them, they fit into the cache
 
 
@@ -170,25 +170,42 @@ def _spread(light: np.ndarray, shot: Shot) -> np.ndarray:
     return blurred
 
 
-def _offsets(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> np.ndarray:
-    """Rays of ``count`` pixels: x and y in pixels from the pixel's centre, and time -0.5 to 0.5; [count, S, 3].
+@dataclass(frozen=True, eq=False)
+class _Lens:
+    """The spread of light over a pixel and the lens's Gaussian: ``share`` of the light up to ``offset``, in pixels."""
 
-    All pixels use the same well-spread points, each shifted at random. Points in fewer dimensions are spread more
-    evenly: the sum of pixel square and lens Gaussian is one variable; disc and time are drawn only if present.
+    share: np.ndarray
+    offset: np.ndarray
+
+    @classmethod
+    def of(cls, blur_px: float) -> "_Lens":
+        offset = np.linspace(-6 * blur_px - 0.5, 6 * blur_px + 0.5, 4001)
+        spread = ndtr((offset + 0.5) / blur_px) - ndtr((offset - 0.5) / blur_px)
+        return cls(np.cumsum(spread) - spread / 2, offset)
+
+
+def _points(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    """Well-spread points [D, S] in 0 to 1, which all pixels use, and the shift of each of ``count`` pixels, [D, n, 1].
+
+    Points in fewer dimensions are spread more evenly: the sum of pixel square and lens Gaussian is one variable; disc
+    and time are drawn only if present.
     """
-    defocus, moves = shot.disc_px > 0, any(shot.motion)
-    dimensions = 2 + 2 * defocus + moves
+    dimensions = 2 + 2 * (shot.disc_px > 0) + any(shot.motion)
     engine = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=int(rng.integers(2**31)))
-    points = (engine.draw(samples, dtype=torch.float64).numpy() + rng.random((count, 1, dimensions))) % 1
-    offset = np.linspace(-6 * shot.blur_px - 0.5, 6 * shot.blur_px + 0.5, 4001)
-    spread = ndtr((offset + 0.5) / shot.blur_px) - ndtr((offset - 0.5) / shot.blur_px)
-    share = np.cumsum(spread) - spread / 2
-    offsets = np.interp(points[..., :2] * share[-1], share, offset)
-    if defocus:
-        radius, angle = shot.disc_px * np.sqrt(points[..., 2]), 2 * math.pi * points[..., 3]
-        offsets += np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
-    time = points[..., -1:] - 0.5 if moves else np.zeros_like(points[..., :1])
-    return np.concatenate([offsets, time], -1)
+    points = engine.draw(samples, dtype=torch.float64).numpy()
+    return points.T, np.moveaxis(rng.random((count, 1, dimensions)), -1, 0)
+
+
+def _offsets(points: np.ndarray, shifts: np.ndarray, lens: _Lens, shot: Shot) -> tuple[np.ndarray, ...]:
+    """Rays of n pixels: x and y in pixels from the pixel's centre, and time -0.5 to 0.5, each [n, S]."""
+    points = points[:, None] + shifts
+    points -= points >= 1
+    beside, below = (np.interp(each * lens.share[-1], lens.share, lens.offset) for each in points[:2])
+    if shot.disc_px > 0:
+        radius, angle = shot.disc_px * np.sqrt(points[2]), 2 * math.pi * points[3]
+        beside += radius * np.cos(angle)
+        below += radius * np.sin(angle)
+    return beside, below, points[-1] - 0.5 if any(shot.motion) else np.zeros_like(beside)
 
 
 def _near(shot: Shot, size: tuple[int, int], start: float, end: float) -> np.ndarray:
@@ -220,20 +237,21 @@ def _trace(light: np.ndarray, shot: Shot, rng: np.random.Generator) -> None:
     centre = (tool.edges[0] + tool.edges[-1]) / 2
     middle = shot.camera.project(torch.from_numpy(shot.tip + centre * shot.direction))  # type: ignore[operator]
     parts = [(part, _SAMPLES) for part in _chunks(bands)] + [(part, _FEW) for part in _chunks(whole & ~bands)]
+    lens = _Lens.of(shot.blur_px)
     for part, samples in parts:
-        offsets = np.moveaxis(_offsets(rng, len(part), samples, shot), -1, 0)
+        points, shifts = _points(rng, len(part), samples, shot)
         around = part[:, None] + np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
         plane = shot.camera.undistort(torch.from_numpy(around)).numpy()
         for first in range(0, len(part), _BLOCK // samples):
             block = slice(first, first + _BLOCK // samples)
-            rays = np.ascontiguousarray(offsets[:, block])
-            _trace_pixels(light, shot, part[block], plane[block], rays, float(middle[1]))
+            offsets = _offsets(points, shifts[:, block], lens, shot)
+            _trace_pixels(light, shot, part[block], plane[block], offsets, float(middle[1]))
 
 
 def _trace_pixels(
-    light: np.ndarray, shot: Shot, pixels: np.ndarray, plane: np.ndarray, offsets: np.ndarray, middle: float
+    light: np.ndarray, shot: Shot, pixels: np.ndarray, plane: np.ndarray, offsets: tuple[np.ndarray, ...], middle: float
 ) -> None:
-    """Trace the rays ``offsets`` [3, n, S] of ``pixels`` (x, y) [n, 2].
+    """Trace the rays of ``pixels`` (x, y) [n, 2]; ``offsets`` are those of :func:`_offsets`.
 
     ``plane`` [n, 5, 2] are their directions, those half a pixel to the right, left, below and above; ``middle`` is the
     row of the middle of the bands.
