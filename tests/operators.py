@@ -206,7 +206,7 @@ def _hologram(kind: type, cone: str, error: float, stride: int = 1, depths=UNEVE
     layer = (-(-grid.shape[0] // stride), -(-grid.shape[1] // stride))
     matrix = cache(lambda: holograms.matrix(layer, grid.shape, grid.pitch, wavelength, depths, cone, stride))
     return Case(
-        f"{kind.__name__}, {cone}, stride {stride}, {'even' if depths is EVEN else 'uneven'} depths",
+        f"{kind.__name__}, {cone}, stride {stride}, {'even' if depths[:2] == EVEN[:2] else 'uneven'} depths",
         lambda: kind(grid, wavelength, depths, cone=cone, stride=stride, **options),
         lambda c: matrix(),
         shape=(len(depths), *layer),
@@ -346,9 +346,10 @@ CASES = [
 ]
 # Holograms of few planes for what takes time with each plane, such as compiling.
 SHALLOW = [
-    _hologram(DirectHologram, "box", 1e-11, stride=2, depths=UNEVEN[:1], grid=Grid((5, 7), GRID.pitch)),
+    _hologram(DirectHologram, "box", 1e-11, stride=2, depths=UNEVEN[:1], grid=Grid((3, 4), GRID.pitch)),
     _hologram(ConvolutionHologram, "full", 1e-11, depths=UNEVEN[:1]),
     _hologram(ConvolutionHologram, "disc", 1e-11, depths=UNEVEN[:2]),
     _hologram(ConvolutionHologram, "taper", 1e-6, stride=2, depths=UNEVEN[:1]),
     _hologram(ConvolutionHologram, "band", 3.8e-3, depths=UNEVEN[:1]),
+    _hologram(AxialHologram, "taper", 1e-3, stride=2, depths=EVEN[:2], tolerance=1e-4),
 ]

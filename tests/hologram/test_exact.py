@@ -105,8 +105,8 @@ def test_adjoint_to_fewer_sources_and_second_derivatives(kind, cone):
     assert back.shape == layers.shape
     left, right = (formed.conj() * field).sum(), (layers.conj() * back).sum()
     assert (left - right).abs() < 1e-12 * formed.norm() * field.norm()
-    small = kind(Grid((4, 5), 4e-6), WAVE, (0.3e-3, 1e-3), cone=cone)
-    assert torch.autograd.gradgradcheck(lambda x: small(x).abs().square(), sources(2, 3, 2).requires_grad_())
+    small = kind(Grid((2, 3), 4e-6), WAVE, (0.3e-3, 1e-3), cone=cone)
+    assert torch.autograd.gradgradcheck(lambda x: small(x).abs().square(), sources(2, 1, 2).requires_grad_())
 
 
 @pytest.mark.parametrize("kind", BOTH)
@@ -134,7 +134,7 @@ def test_what_is_dark_changes_nothing_where_it_cannot_be_asked_for(kind, monkeyp
 @pytest.mark.parametrize("kind", [*BOTH, AxialHologram])
 def test_a_compiled_hologram_takes_layers_of_several_sizes(kind):
     torch.compiler.reset()
-    operator = kind(GRID, WAVE, (0.3e-3, 0.34e-3), cone="taper")
+    operator = kind(Grid((3, 5), GRID.pitch), WAVE, (0.3e-3, 0.34e-3), cone="taper")
     compiled = torch.compile(operator, fullgraph=True, backend="eager")
     for shape in ((4, 5), (6, 3), (4, 5)):
         layers = sources(2, *shape)

@@ -142,12 +142,19 @@ class DistanceFilter(SpectralFilter):
             return self.transfer_function(field.dtype)
         if field.dtype == torch.complex64:
             return self.single_kernel
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_exporting():
             return self.transfer_function()
-        if self.double_kernel is None:
-            with torch.inference_mode(False):  # a later call may need gradients
-                self.double_kernel = self.transfer_function()
+        _keep_double_kernel(self)
+        assert self.double_kernel is not None
         return self.double_kernel
+
+
+@torch.compiler.assume_constant_result
+def _keep_double_kernel(operator: DistanceFilter) -> None:
+    """Have the kernel for complex128; computed while torch.compile traces, not in each call of what it compiles."""
+    if operator.double_kernel is None:
+        with torch.inference_mode(False):  # a later call may need gradients
+            operator.double_kernel = operator.transfer_function()
 
 
 class _PaddedKernel(DistanceFilter):

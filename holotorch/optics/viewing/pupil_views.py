@@ -102,11 +102,10 @@ class PupilViews(PreciseModule):
         """The transfer functions, complex [C, V, P, Q], in the dtype of ``field``."""
         if field.dtype == torch.complex64:
             return self.single_kernel
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_exporting():
             return self._kernel(field.device)
-        if self.double_kernel is None:
-            with torch.inference_mode(False):  # a later call may need gradients
-                self.double_kernel = self._kernel(field.device)
+        _keep_double_kernel(self, field.device)
+        assert self.double_kernel is not None
         return self.double_kernel
 
     def forward(self, field: Tensor) -> Tensor:
@@ -156,3 +155,11 @@ def view_kernel(padded: Grid, wavelength: Tensor, view: View, distance: float) -
     y, x = (wavelength[:, None, None] * f - sine for f, sine in zip((fy, fx), view.centre, strict=True))
     open_pupil = (y.square() + x.square() <= view.radius**2) & (y * view.covered[0] + x * view.covered[1] <= 0)
     return kernel * open_pupil
+
+
+@torch.compiler.assume_constant_result
+def _keep_double_kernel(views: PupilViews, device: torch.device) -> None:
+    """Have the kernels for complex128; computed while torch.compile traces, not in each call of what it compiles."""
+    if views.double_kernel is None:
+        with torch.inference_mode(False):  # a later call may need gradients
+            views.double_kernel = views._kernel(device)

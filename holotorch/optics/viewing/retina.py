@@ -323,7 +323,7 @@ class Retina(PreciseModule):
         self.adopt("display", display)
         self.adopt("eye", eye)
         self.plane, self.paraxial = plane, paraxial
-        self._factors: tuple[tuple[torch.dtype, torch.device], list[imaging.CollapseFactors]] | None = None
+        self._factors: dict[tuple[torch.dtype, torch.device], list[imaging.CollapseFactors]] = {}
         self.plan = plan_retina(
             grid, self.wavelengths, display, eye, tolerance=tolerance, plane=plane, paraxial=paraxial, **options
         )
@@ -356,17 +356,11 @@ class Retina(PreciseModule):
     def _constant_factors(self, like: Tensor) -> list[imaging.CollapseFactors] | None:
         """The factors of the collapse for fields as ``like``, kept from the first call; None for learned lengths."""
         lengths = [self.plane, *vars(self.display).values(), *vars(self.eye).values(), *self.eye.aberrations.values()]
-        if torch.compiler.is_compiling() or any(isinstance(each, Tensor) for each in lengths):
+        if torch.compiler.is_exporting() or any(isinstance(each, Tensor) for each in lengths):
             return None
         checks.field("field", like, (len(self.wavelengths), *self.grid.shape))
-        key = like.dtype, like.device
-        if self._factors is None or self._factors[0] != key:
-            assert isinstance(self.plan.sampling, imaging.CollapseSampling)
-            plane = self.display.object_plane(self.plane, self.eye.accommodation)
-            setup = self.grid, self.wavelengths, self.display, self.eye, plane
-            with torch.inference_mode(False), torch.no_grad():
-                self._factors = key, imaging.collapse_factors(like, *setup, self.plan.sampling, self.paraxial)
-        return self._factors[1]
+        _keep_factors(self, like.dtype, like.device)
+        return self._factors[like.dtype, like.device]
 
     def forward(self, field: Tensor) -> Tensor:
         """Intensity on the retina, real [..., C, H, W]; its sum times the pitches is the power that arrives."""
@@ -375,6 +369,19 @@ class Retina(PreciseModule):
     def extra_repr(self) -> str:
         """Sampling and plan, for ``print(module)``."""
         return f"grid={self.grid}, wavelengths={self.wavelengths}, {self.plan.reason}"
+
+
+@torch.compiler.assume_constant_result
+def _keep_factors(retina: Retina, dtype: torch.dtype, device: torch.device) -> None:
+    """Have the factors of the collapse; computed while torch.compile traces, not in each call of what it compiles."""
+    if (dtype, device) not in retina._factors:
+        assert isinstance(retina.plan.sampling, imaging.CollapseSampling)
+        plane = retina.display.object_plane(retina.plane, retina.eye.accommodation)
+        setup = retina.grid, retina.wavelengths, retina.display, retina.eye, plane
+        like = torch.empty(0, dtype=dtype, device=device)
+        with torch.inference_mode(False), torch.no_grad():
+            factors = imaging.collapse_factors(like, *setup, retina.plan.sampling, retina.paraxial)
+        retina._factors[dtype, device] = factors
 
 
 def retinal_image(

@@ -20,7 +20,8 @@ from holotorch.tracking.pose.catheter import Catheter
 _SAMPLES = 256  # rays of a pixel near the bands: the standard deviation of their levels is then 0.6
 _FEW = 32  # rays of a pixel near the rest of the catheter
 _BESIDE = 0.015  # metres beyond the bands with many rays
-_CHUNK = 4096  # pixels traced at a time
+_CHUNK = 4096  # pixels that share well-spread points
+_BLOCK = 1 << 15  # rays traced at a time: with all that follows from them, they fit into the cache
 
 
 @dataclass(frozen=True)
@@ -169,25 +170,42 @@ def _spread(light: np.ndarray, shot: Shot) -> np.ndarray:
     return blurred
 
 
-def _offsets(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> np.ndarray:
-    """Rays of ``count`` pixels: x and y in pixels from the pixel's centre, and time -0.5 to 0.5; [count, S, 3].
+@dataclass(frozen=True, eq=False)
+class _Lens:
+    """The spread of light over a pixel and the lens's Gaussian: ``share`` of the light up to ``offset``, in pixels."""
 
-    All pixels use the same well-spread points, each shifted at random. Points in fewer dimensions are spread more
-    evenly: the sum of pixel square and lens Gaussian is one variable; disc and time are drawn only if present.
+    share: np.ndarray
+    offset: np.ndarray
+
+    @classmethod
+    def of(cls, blur_px: float) -> "_Lens":
+        offset = np.linspace(-6 * blur_px - 0.5, 6 * blur_px + 0.5, 4001)
+        spread = ndtr((offset + 0.5) / blur_px) - ndtr((offset - 0.5) / blur_px)
+        return cls(np.cumsum(spread) - spread / 2, offset)
+
+
+def _points(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    """Well-spread points [D, S] in 0 to 1, which all pixels use, and the shift of each of ``count`` pixels, [D, n, 1].
+
+    Points in fewer dimensions are spread more evenly: the sum of pixel square and lens Gaussian is one variable; disc
+    and time are drawn only if present.
     """
-    defocus, moves = shot.disc_px > 0, any(shot.motion)
-    dimensions = 2 + 2 * defocus + moves
+    dimensions = 2 + 2 * (shot.disc_px > 0) + any(shot.motion)
     engine = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=int(rng.integers(2**31)))
-    points = (engine.draw(samples, dtype=torch.float64).numpy() + rng.random((count, 1, dimensions))) % 1
-    offset = np.linspace(-6 * shot.blur_px - 0.5, 6 * shot.blur_px + 0.5, 4001)
-    spread = ndtr((offset + 0.5) / shot.blur_px) - ndtr((offset - 0.5) / shot.blur_px)
-    share = np.cumsum(spread) - spread / 2
-    offsets = np.interp(points[..., :2] * share[-1], share, offset)
-    if defocus:
-        radius, angle = shot.disc_px * np.sqrt(points[..., 2]), 2 * math.pi * points[..., 3]
-        offsets += np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
-    time = points[..., -1:] - 0.5 if moves else np.zeros_like(points[..., :1])
-    return np.concatenate([offsets, time], -1)
+    points = engine.draw(samples, dtype=torch.float64).numpy()
+    return points.T, np.moveaxis(rng.random((count, 1, dimensions)), -1, 0)
+
+
+def _offsets(points: np.ndarray, shifts: np.ndarray, lens: _Lens, shot: Shot) -> tuple[np.ndarray, ...]:
+    """Rays of n pixels: x and y in pixels from the pixel's centre, and time -0.5 to 0.5, each [n, S]."""
+    points = points[:, None] + shifts
+    points -= points >= 1
+    beside, below = (np.interp(each * lens.share[-1], lens.share, lens.offset) for each in points[:2])
+    if shot.disc_px > 0:
+        radius, angle = shot.disc_px * np.sqrt(points[2]), 2 * math.pi * points[3]
+        beside += radius * np.cos(angle)
+        below += radius * np.sin(angle)
+    return beside, below, points[-1] - 0.5 if any(shot.motion) else np.zeros_like(beside)
 
 
 def _near(shot: Shot, size: tuple[int, int], start: float, end: float) -> np.ndarray:
@@ -219,21 +237,39 @@ def _trace(light: np.ndarray, shot: Shot, rng: np.random.Generator) -> None:
     centre = (tool.edges[0] + tool.edges[-1]) / 2
     middle = shot.camera.project(torch.from_numpy(shot.tip + centre * shot.direction))  # type: ignore[operator]
     parts = [(part, _SAMPLES) for part in _chunks(bands)] + [(part, _FEW) for part in _chunks(whole & ~bands)]
+    lens = _Lens.of(shot.blur_px)
     for part, samples in parts:
-        offsets = _offsets(rng, len(part), samples, shot)
+        points, shifts = _points(rng, len(part), samples, shot)
         around = part[:, None] + np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
         plane = shot.camera.undistort(torch.from_numpy(around)).numpy()
-        right, down = plane[:, 1] - plane[:, 2], plane[:, 3] - plane[:, 4]  # distortion is linear within a pixel
-        rays = plane[:, :1] + offsets[..., :1] * right[:, None] + offsets[..., 1:2] * down[:, None]
-        late = (part[:, None, 1] + offsets[..., 1] - float(middle[1])) / size[0]
-        moved = offsets[..., 2:] * np.asarray(shot.motion) + late[..., None] * np.asarray(shot.rolling)
-        colour, cover = _tube(shot, rays, moved)
-        x, y = part[:, None, 0] + offsets[..., 0], part[:, None, 1] + offsets[..., 1]
-        for rod in shot.before:
-            over, paint = rod.paint(x, y)
-            colour[over], cover[over] = paint[over], 1.0
-        columns, rows = part.T
-        light[rows, columns] = colour.mean(1) + (1 - cover.mean(1))[:, None] * light[rows, columns]
+        for first in range(0, len(part), _BLOCK // samples):
+            block = slice(first, first + _BLOCK // samples)
+            offsets = _offsets(points, shifts[:, block], lens, shot)
+            _trace_pixels(light, shot, part[block], plane[block], offsets, float(middle[1]))
+
+
+def _trace_pixels(
+    light: np.ndarray, shot: Shot, pixels: np.ndarray, plane: np.ndarray, offsets: tuple[np.ndarray, ...], middle: float
+) -> None:
+    """Trace the rays of ``pixels`` (x, y) [n, 2]; ``offsets`` are those of :func:`_offsets`.
+
+    ``plane`` [n, 5, 2] are their directions, those half a pixel to the right, left, below and above; ``middle`` is the
+    row of the middle of the bands.
+    """
+    right, down = plane[:, 1] - plane[:, 2], plane[:, 3] - plane[:, 4]  # distortion is linear within a pixel
+    beside, below, time = offsets
+    rays = [plane[:, :1, k] + beside * right[:, k, None] + below * down[:, k, None] for k in (0, 1)]
+    x, y = pixels[:, None, 0] + beside, pixels[:, None, 1] + below
+    late = (y - middle) / light.shape[0]
+    moved = np.zeros((3, 1, 1))
+    if any(shot.motion) or any(shot.rolling):
+        moved = np.stack([time * a + late * b for a, b in zip(shot.motion, shot.rolling, strict=True)])
+    colour, cover = _tube(shot, np.stack([*rays, np.ones_like(x)]), moved)
+    for rod in shot.before:
+        over, paint = rod.paint(x, y)
+        colour[over], cover[over] = paint[over], 1.0
+    columns, rows = pixels.T
+    light[rows, columns] = colour.mean(1) + (1 - cover.mean(1))[:, None] * light[rows, columns]
 
 
 def _chunks(mask: np.ndarray) -> list[np.ndarray]:
@@ -243,56 +279,76 @@ def _chunks(mask: np.ndarray) -> list[np.ndarray]:
     return [pixels[first : first + _CHUNK] for first in range(0, len(pixels), _CHUNK)]
 
 
-def _tube(shot: Shot, rays: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Light [n, S, 3] of the tube along rays (x, y, 1), of tips shifted by ``moved``, and cover [n, S]."""
-    tool, axis = shot.catheter, shot.direction
-    assert tool is not None and axis is not None and shot.tip is not None
-    ray = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    back = -(shot.tip + moved)  # from the tip to the camera
-    ray_along, back_along = ray @ axis, back @ axis
-    ray_across = ray - ray_along[..., None] * axis
-    back_across = back - back_along[..., None] * axis
-    a = np.maximum((ray_across**2).sum(-1), 1e-12)
-    b = (ray_across * back_across).sum(-1)
-    root = b**2 - a * ((back_across**2).sum(-1) - tool.radius**2)
+def _tube(shot: Shot, ray: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Light [n, S, 3] of the tube along rays [3, n, S], of tips shifted by ``moved`` [3, n or 1, S or 1], and cover."""
+    tool = shot.catheter
+    assert tool is not None and shot.direction is not None and shot.tip is not None
+    # Coordinates are the first axis: NumPy is several times as slow over a last axis of three.
+    axis, tip = (np.asarray(each)[:, None, None] for each in (shot.direction, shot.tip))
+    ray = ray / np.sqrt(_dot(ray, ray))
+    back = -(tip + moved)  # from the tip to the camera
+    ray_along, back_along = _dot(ray, axis), _dot(back, axis)
+    ray_across = ray - ray_along * axis
+    back_across = np.broadcast_to(back - back_along * axis, ray.shape)
+    a = np.maximum(_dot(ray_across, ray_across), 1e-12)
+    b = _dot(ray_across, back_across)
+    root = b**2 - a * (_dot(back_across, back_across) - tool.radius**2)
     depth = (-b - np.sqrt(np.maximum(root, 0))) / a
     place = back_along + depth * ray_along
     hit = (root > 0) & (depth > 0) & (place >= 0) & (place <= tool.length)
-    colour, cover = np.zeros(ray.shape, np.float32), np.zeros(hit.shape, np.float32)
+    colour, cover = np.zeros((*hit.shape, 3), np.float32), np.zeros(hit.shape, np.float32)
     if not hit.any():
         return colour, cover
-    ray, place = ray[hit], place[hit]
-    normal = (back_across[hit] + depth[hit][:, None] * ray_across[hit]) / tool.radius
+    normal = (back_across[:, hit] + depth[hit] * ray_across[:, hit]) / tool.radius
+    albedo, printed = _reflectance(shot, place[hit], normal)
+    light, solid = _shaded(shot, ray[:, hit], normal, albedo, printed)
+    colour[hit], cover[hit] = light.T, solid
+    return colour, cover
+
+
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Products of vectors, whose coordinates are the first axis."""
+    return one[0] * other[0] + (one[1] * other[1] + one[2] * other[2])
+
+
+def _reflectance(shot: Shot, place: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectance [3, k] of the tube at ``place`` [k], in metres from the tip, and whether it is printed there."""
+    tool, axis = shot.catheter, shot.direction
+    assert tool is not None and axis is not None
     band = np.searchsorted(np.asarray(tool.edges), place, side="right")
     inks = np.asarray(tool.colours) / 255
     inks = np.where(inks <= 0.04045, inks / 12.92, ((inks + 0.055) / 1.055) ** 2.4) * shot.tints
-    albedo = np.stack([np.asarray(shot.clear), *inks, np.asarray(shot.clear)])[band]
+    albedo = np.stack([np.asarray(shot.clear), *inks, np.asarray(shot.clear)]).T[:, band]
     printed = (band > 0) & (band < len(tool.edges))
     if shot.stain is not None:
         start, end, angle, width = shot.stain
         side = np.cross(axis, [0.0, 0.0, 1.0])
         side /= np.linalg.norm(side)
-        around = np.arctan2(normal @ np.cross(axis, side), normal @ side)
+        around = np.arctan2(_dot(normal, np.cross(axis, side)), _dot(normal, side))
         near = np.abs((around - angle + math.pi) % (2 * math.pi) - math.pi) < width
         stained = near & (place > start) & (place < end)
-        albedo = np.where(stained[:, None], np.array([0.12, 0.008, 0.008]), albedo)
-    lit = np.broadcast_to(np.asarray(shot.ambient), albedo.shape).copy()
+        albedo = np.where(stained, np.array([0.12, 0.008, 0.008])[:, None], albedo)
+    return albedo, printed
+
+
+def _shaded(
+    shot: Shot, ray: np.ndarray, normal: np.ndarray, albedo: np.ndarray, printed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Light [3, k] along rays [3, k] to a surface of the tube, and its cover [k]."""
+    lit = np.broadcast_to(np.asarray(shot.ambient)[:, None], albedo.shape).copy()
     gloss = np.zeros_like(lit)
     for lamp in shot.lights:
-        towards, tone = np.asarray(lamp.direction), np.asarray(lamp.colour)
-        towards = towards / np.linalg.norm(towards)
-        cosine = np.maximum(normal @ towards, 0)
+        towards, tone = np.asarray(lamp.direction), np.asarray(lamp.colour)[:, None]
+        towards = (towards / np.linalg.norm(towards))[:, None]
+        cosine = np.maximum(_dot(normal, towards), 0)
         halfway = towards - ray
-        halfway /= np.linalg.norm(halfway, axis=-1, keepdims=True)
-        lit += cosine[:, None] * tone
-        shine = np.maximum((normal * halfway).sum(-1), 0) ** shot.sharpness * (cosine > 0)
-        gloss += shot.gloss * shine[:, None] * tone
-    facing = np.maximum(-(normal * ray).sum(-1), 0.05)
+        halfway /= np.sqrt(_dot(halfway, halfway))
+        lit += cosine * tone
+        shine = np.maximum(_dot(normal, halfway), 0) ** shot.sharpness * (cosine > 0)
+        gloss += shot.gloss * shine * tone
+    facing = np.maximum(-_dot(normal, ray), 0.05)
     solid = np.where(printed, 1.0, 1 - (1 - shot.opacity) ** (1 / facing))
-    colour[hit] = solid[:, None] * albedo * lit + gloss
-    cover[hit] = solid
-    return colour, cover
+    return solid * albedo * lit + gloss, solid
 
 
 def _cover_rest(light: np.ndarray, shot: Shot) -> None:
