@@ -1,8 +1,9 @@
 import pytest
 import torch
 from stand_in import CAMERA, SIZE, StandIn
-from undrawn import without_figures
+from undrawn import Blank, without_figures
 
+from holotorch.experiments.runs import figures
 from holotorch.experiments.tracking import source as track_source
 from holotorch.experiments.tracking.devices import save_camera, save_catheter
 from holotorch.tracking import THESIS
