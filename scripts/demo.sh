@@ -3,4 +3,5 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/setup.sh ""
-exec .venv/bin/holotorch demo "$@"
+.venv/bin/holotorch demo "$@"
+echo "To go on:  . .venv/bin/activate; holotorch run configs/pec/fourier.yaml" >&2

@@ -13,6 +13,7 @@ from holotorch.core.complex import phasor
 from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
 from holotorch.core.learning import fixed
+from holotorch.core.tracing import constant_when_compiled
 from holotorch.hologram.cone import Cone, taper
 from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.nodes import Nodes, axial_range, choose_nodes
@@ -201,6 +202,7 @@ class AxialHologram(LayerHologram):
         return out
 
 
+@constant_when_compiled
 def _keep_design(operator: AxialHologram, shape: tuple[int, int], *, warn: bool = False) -> None:
     """Have the design for ``shape`` in ``operator``; computed when torch.compile traces, which cannot follow NumPy."""
     if shape not in operator._designs:
@@ -213,10 +215,6 @@ def _keep_design(operator: AxialHologram, shape: tuple[int, int], *, warn: bool 
             checks.SamplingWarning,
             stacklevel=3,
         )
-
-
-# What torch.compiler.assume_constant_result does, which loads all of torch's compiler first, for two seconds.
-_keep_design._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 class Accumulator:

@@ -25,10 +25,19 @@ def find_config(name: str | Path) -> Path | None:
 
 
 def similar_config(path: Path) -> Path | None:
-    """The configuration most similar to ``path``, which is no file, among its neighbours; None if there is none."""
+    """The configuration most similar to ``path``, which is no file; None if there is none.
+
+    It is one of the neighbours, or else a bundled one with this name in another folder.
+    """
     names = {each.name for candidate in _candidates(path) for each in candidate.parent.glob("*.yaml")}
     near = difflib.get_close_matches(path.name, sorted(names), 1)
-    return path.with_name(near[0]) if near else None
+    if near:
+        return path.with_name(near[0])
+    for folder in (package / "configs" for package in Path(__file__).parents[1:3]):
+        for same in folder.rglob("*.yaml"):
+            if same.stem == path.stem:
+                return "configs" / same.relative_to(folder)
+    return None
 
 
 def _candidates(path: Path) -> tuple[Path, ...]:

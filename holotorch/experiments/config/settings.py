@@ -1,5 +1,7 @@
 """Building blocks of configurations: units, ranges, and sections that several kinds share."""
 
+import contextlib
+import difflib
 import math
 import re
 from collections.abc import Callable
@@ -139,7 +141,11 @@ def existing(there: Callable[[str], object], missing: Callable[[str], str]) -> B
 
 
 def _no_path(value: str) -> str:
-    return f"expected a file or folder that exists, got {short(value)}"
+    path, near = Path(value), []
+    with contextlib.suppress(OSError, ValueError):
+        near = difflib.get_close_matches(path.name, [each.name for each in path.parent.iterdir()], 1, cutoff=0.8)
+    hint = f"; did you mean {path.with_name(near[0])}?" if near else ""
+    return f"expected a file or folder that exists, got {short(value)}{hint}"
 
 
 Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]

@@ -13,6 +13,7 @@ Key = tuple[str | int, ...]
 _MAX_BYTES = 1 << 17  # limit for a file; parsing that many bytes takes up to 4 s
 _MAX_VALUES = 100_000  # a file of _MAX_BYTES can have more values only through YAML aliases
 _MAX_DEPTH = 50  # levels of nested keys; configurations have fewer than ten
+_BY_NAME = {"transfer": "preset"}  # sections that may be given as the value of one of their keys
 MOST_MISTAKES = 50  # limit for the number of mistakes that are listed
 
 
@@ -75,6 +76,8 @@ def override(source: Source, word: str, mistakes: list[str]) -> None:
         return
     parent = source.data
     for part in key[:-1]:
+        if part in _BY_NAME and isinstance(parent.get(part), str):
+            parent[part] = {_BY_NAME[part]: parent[part]}
         parent = parent.setdefault(part, {})
         if not isinstance(parent, dict):
             mistakes.append(f"argument {word!r}: {part!r} is a single value and has no settings inside")

@@ -24,6 +24,7 @@ _PIXEL_BYTES = {"apg": 70, "adam": 90, "lbfgs": 190}  # in the solver, per pixel
 _IN_TURN_BYTES, _GAPS_BYTES = {"apg": 85, "adam": 85, "lbfgs": 215}, 45
 _SOLVER_BYTES = 60  # in the solver, per padded sample of the frames that are propagated at once
 _SCORED_BYTES = 350  # in the float64 simulation of the result with its scores, per pixel of all colours of a frame
+_SCORED_WITHOUT_GAPS = 260  # the same of arrays that are not in the heap
 _EVALUATION_BYTES = 112  # the same in the near field, per grid sample of one colour besides
 _BASELINE_BYTES = 330  # per pixel of all colours of a frame: the heap of small arrays after the methods of comparison
 _MAPPED = 32e6  # bytes above which an array is not in the heap, but returned to the system at once
@@ -85,7 +86,7 @@ def _peak_bytes(experiment: PECExperiment) -> float:
         per_pixel -= _GAPS_BYTES
     solver = double * (per_pixel * frames * frame + _SOLVER_BYTES * at_once * padded)
     images = frame * max(1, (1 + len(experiment.distances)) // 2)
-    scored = _SCORED_BYTES * images
+    scored = (_SCORED_BYTES if 8 * frame < _MAPPED else _SCORED_WITHOUT_GAPS) * images
     if experiment.distances:
         scored += 16 * padded + _EVALUATION_BYTES * 5 * samples
     heap = _BASELINE_BYTES * images if settings.report.baselines and 8 * frame < _MAPPED else 0

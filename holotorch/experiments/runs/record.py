@@ -30,6 +30,10 @@ class RunRecord:
         self.folder, self.title = folder, folder.resolve().name
         names = [name for name in SUMMARIES if (folder / name).is_file()]
         if not names:
+            if not folder.exists():
+                raise ConfigError(
+                    [f"{folder}: no such folder in {folder.parent}{runs_inside(folder.parent, command, wanted)}"]
+                )
             hint = f"; finish it with: holotorch resume {folder}" if (folder / "plan.json").is_file() else ""
             hint = hint or runs_inside(folder, command, wanted)
             raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{hint}"])

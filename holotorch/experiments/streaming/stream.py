@@ -206,6 +206,8 @@ def stream(
         complete = False
     except OSError as error:
         raise _config_error(error) from None
+    if page is not None and complete:
+        show("The page has ended with its source; holotorch stream --view --replay RUN repeats a run of track")
     links = [link for _, sender in senders for link in sender.links]
     delivered = (
         page is not None or not links or server is not None or any(link.sent or not link.errors for link in links)

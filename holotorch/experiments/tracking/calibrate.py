@@ -42,9 +42,9 @@ def calibrate_photographs(
         ConfigError: The photographs cannot be read, differ in size, show no board, or do not determine a camera.
     """
     kind = parse_board(board)
-    if out.exists():
-        raise ConfigError([f"{out} exists already; choose another --out or delete it"])
     paths = _listed(files)
+    if out.exists() and all(path.exists() for path in paths):  # a missing photograph is named first, below
+        raise ConfigError([f"{out} exists already; choose another --out or delete it"])
     mistakes: list[str] = []
     missing: dict[str, str] = {}
     views: list[View] = []

@@ -41,12 +41,12 @@ def calibrate_catheter(
     Raises:
         ConfigError: A file cannot be used, a place is none or not on the picture, or the colours cannot be told apart.
     """
-    if out.exists():
-        raise ConfigError([f"{out} exists already; choose another --out or delete it"])
     source = geometry or Path(GEOMETRY)
     tool = build_catheter(load_catheter(find_config(source) or source))
     pixels = _pixels(photograph)
     boxes = _boxes(places, len(tool.colours), pixels.shape[-2:])
+    if out.exists():
+        raise ConfigError([f"{out} exists already; choose another --out or delete it"])
     levels, spread = zip(*(_colour(pixels, box) for box in boxes), strict=True)
     camera = Camera(torch.eye(3, dtype=torch.float64), torch.zeros(5, dtype=torch.float64))  # of the tone sRGB
     try:

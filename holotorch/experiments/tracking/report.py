@@ -139,6 +139,22 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     return summary | {"notes": notes, "pictures": log.pictures, "peak_memory_bytes": peak_memory()}
 
 
+_LONGER = "longer bands, a nearer camera or more pixels help, and colours at full resolution (--record)"
+_COLOURS = "are the colours of the catheter's file those of this video? holotorch calibrate catheter reads them"
+_ADVICE = {
+    Status.BAD_FRAME: "is the video of the camera's size, and neither black nor white?",
+    Status.NO_CATHETER: _COLOURS,
+    Status.BANDS_MISSING: f"{_COLOURS}; {_LONGER}",
+    Status.NO_AXIS: _COLOURS,
+    Status.TOO_NARROW: _LONGER,
+    Status.EDGES_UNCLEAR: _LONGER,
+    Status.OUT_OF_FRAME: "the bands must lie within the picture",
+    Status.OUTSIDE_CAMERA: "the camera's file says nothing there: calibrate with boards near the picture's edges",
+    Status.INCONSISTENT: "no pose explains the edges: are `edges` those of this catheter, and the camera's file right?",
+    Status.UNCERTAIN: _LONGER,
+}
+
+
 def verdict(summary: dict[str, Any]) -> str:
     """The summary in one line."""
     statuses = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
@@ -148,6 +164,15 @@ def verdict(summary: dict[str, Any]) -> str:
     if "stability" in summary:
         text += f"; S_RMS {summary['stability']['s_rms_mm']:.3f} mm unfiltered"
     return text
+
+
+def refusals(summary: dict[str, Any]) -> list[str]:
+    """A line with the commonest refusal and what to look at, if half of the frames or more have no pose."""
+    counts = {name: count for name, count in summary["statuses"].items() if not Status[name].answered}
+    if not counts or 2 * summary["answered"] > summary["frames"]:
+        return []
+    commonest = max(counts, key=lambda name: counts[name])
+    return [f"Refused    most often {commonest}: {_ADVICE[Status[commonest]]}"]
 
 
 def save_figure(folder: Path, log: Log) -> None:

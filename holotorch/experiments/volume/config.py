@@ -182,8 +182,10 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     source, transfer, hologram = settings.volume, settings.transfer, settings.hologram
     if not (source.path or source.scene or source.phantom):
         problems.append((("volume",), "expected a path, a scene or a phantom"))
-    if sum(item is not None for item in (transfer.preset, transfer.file, transfer.points)) != 1:
-        problems.append((("transfer",), "expected one of preset, file or points"))
+    given = [name for name in ("preset", "file", "points") if getattr(transfer, name) is not None]
+    if len(given) != 1:
+        got = f"{' and '.join(given)}; 'transfer={{preset: bone}}' replaces the whole section" if given else "none"
+        problems.append((("transfer",), f"expected one of preset, file or points, got {got}"))
     if (transfer.low is None) != (transfer.high is None):
         problems.append((("transfer",), "expected both low and high, or neither: then they follow from the histogram"))
     if transfer.low is not None and transfer.high is not None and transfer.low >= transfer.high:

@@ -66,7 +66,9 @@ class VolumeEvaluation:
         """Scores of the mean so far: SSIM, speckle contrast, and the error of each part of the scene by focus."""
         pictures, reference = self.pictures, self.rendering.clamp(0, 1)
         numbers: dict[str, Any] = {"realisations": self.count}
-        if min(reference.shape[-2:]) >= SSIM_WINDOW:
+        if not self.visible.any():
+            numbers["nothing_visible"] = True  # a black picture is like any other black one
+        elif min(reference.shape[-2:]) >= SSIM_WINDOW:
             in_focus, *at_depth = (
                 ssim(picture.clamp(0, 1), reference, data_range=1.0).mean().item()
                 for picture in (self.sharpest(pictures), *pictures)

@@ -23,6 +23,8 @@ _CAPTIONS = {
 
 def volume_outcome(summary: dict[str, Any]) -> list[str]:
     """Lines to print: how the refocused hologram compares with the rendering, and the errors of the calculation."""
+    if summary.get("nothing_visible"):
+        return ["Result     nothing of the volume is visible, so there is no score: change transfer"]
     scores = []
     if "ssim_in_focus" in summary:
         scores.append(

@@ -16,6 +16,7 @@ from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
+from holotorch.core.tracing import constant_when_compiled
 from holotorch.optics.free_space.geometry import least_padding
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
 
@@ -149,7 +150,7 @@ class DistanceFilter(SpectralFilter):
         return self.double_kernel
 
 
-@torch.compiler.assume_constant_result
+@constant_when_compiled
 def _keep_double_kernel(operator: DistanceFilter) -> None:
     """Have the kernel for complex128; computed while torch.compile traces, not in each call of what it compiles."""
     if operator.double_kernel is None:

@@ -15,6 +15,7 @@ from holotorch.core.learning import PreciseModule
 from holotorch.core.operator import Wavelengths
 from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
+from holotorch.core.tracing import constant_when_compiled
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel
 
 
@@ -157,7 +158,7 @@ def view_kernel(padded: Grid, wavelength: Tensor, view: View, distance: float) -
     return kernel * open_pupil
 
 
-@torch.compiler.assume_constant_result
+@constant_when_compiled
 def _keep_double_kernel(views: PupilViews, device: torch.device) -> None:
     """Have the kernels for complex128; computed while torch.compile traces, not in each call of what it compiles."""
     if views.double_kernel is None:

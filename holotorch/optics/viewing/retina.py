@@ -15,6 +15,7 @@ from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.core.learning import PreciseModule
 from holotorch.core.quantities import WIDTH
+from holotorch.core.tracing import constant_when_compiled
 from holotorch.optics.viewing import imaging
 from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
@@ -371,7 +372,7 @@ class Retina(PreciseModule):
         return f"grid={self.grid}, wavelengths={self.wavelengths}, {self.plan.reason}"
 
 
-@torch.compiler.assume_constant_result
+@constant_when_compiled
 def _keep_factors(retina: Retina, dtype: torch.dtype, device: torch.device) -> None:
     """Have the factors of the collapse; computed while torch.compile traces, not in each call of what it compiles."""
     if (dtype, device) not in retina._factors:

@@ -219,6 +219,18 @@ def test_files_that_are_no_configuration(written, text, message):
     assert any(message in line for line in mistakes(written(text)))
 
 
+@pytest.mark.parametrize("name", ["config/pec/fourier.yaml", "fourier"])
+def test_a_bundled_configuration_is_suggested_from_any_folder(name):
+    with pytest.raises(ConfigError, match="did you mean configs/pec/fourier.yaml"):
+        load_config(name)
+
+
+def test_a_file_with_nearly_this_name_is_suggested(tmp_path):
+    (tmp_path / "kernel.csv").write_text("1")
+    with pytest.raises(ConfigError, match=f"exists, got '{tmp_path}/kernl.csv'; did you mean {tmp_path}/kernel.csv"):
+        load_config(CONFIGS / "pec" / "fresnel.yaml", [f"modulator={{kernel: {tmp_path / 'kernl.csv'}}}"])
+
+
 def test_a_near_image_needs_a_pitch_of_about_a_wavelength(written):
     near = GOOD.replace("fraunhofer", "fresnel, distance: 1 mm")
     assert mistakes(written(near), "grid.pitch=0.5 um") == [

@@ -50,6 +50,12 @@ def test_a_folder_of_runs_is_answered_by_their_names_and_the_command(words, name
     assert error.endswith(f"; give one of the runs in it: {names}; for the latest: holotorch {latest}\n")
 
 
+def test_a_folder_that_does_not_exist_is_answered_by_the_runs_beside_it(runs, capsys):
+    assert main(["report", f"{runs}/none"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"{runs}/none: no such folder in {runs}; give one of the runs in it: ")
+
+
 def test_where_all_is_complete_there_is_nothing_to_resume(runs, tmp_path, capsys):
     for name in KIND:
         (tmp_path / "runs" / name / "summary.json").write_text("{}")

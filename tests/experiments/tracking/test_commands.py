@@ -18,6 +18,7 @@ from holotorch.experiments import execute
 from holotorch.experiments.streaming import check as stream_check
 from holotorch.experiments.streaming import stream
 from holotorch.experiments.tracking import run, synthetic
+from holotorch.experiments.tracking.report import refusals
 from holotorch.experiments.tracking.synthetic import write_synthetic
 from holotorch.tracking.pose.status import Status
 from holotorch.tracking.streaming.packet import PosePacket, decode
@@ -256,7 +257,18 @@ def test_calibrate_does_not_write_over_a_file(capsys):
     Path("camera.yaml").write_text("mine")
     cv2.imwrite("0.png", np.full((120, 160, 3), 90, np.uint8))
     assert "camera.yaml exists already" in said(capsys, "calibrate", "0.png")
+    assert "photo: no such file or folder" in said(capsys, "calibrate", "photo")
     assert Path("camera.yaml").read_text() == "mine"
+
+
+def test_a_run_with_few_poses_says_what_to_look_at():
+    told = {"statuses": {"OK": 3, "INCONSISTENT": 4, "TOO_NARROW": 1}, "answered": 3, "frames": 8}
+    (line,) = refusals(told)
+    assert line.startswith("Refused    most often INCONSISTENT: no pose explains the edges: are `edges`")
+    assert not refusals({"statuses": {"OK": 5, "NO_AXIS": 4}, "answered": 5, "frames": 9})
+    for status in Status:
+        told = {"statuses": {status.name: 2}, "answered": 0, "frames": 2}
+        assert len(refusals(told)) == (not status.answered)
 
 
 def free_port() -> int:

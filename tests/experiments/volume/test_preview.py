@@ -37,6 +37,18 @@ def test_a_preset_without_values_lies_between_air_and_the_brightest(scan, capsys
     assert "the preset bone lies between" in capsys.readouterr().out
     assert main(["check", *words[:-1], "transfer={preset: bone, low: 3}"]) == 2
     assert "expected both low and high, or neither" in capsys.readouterr().err
+    assert main(["check", *words[:-1], "transfer=bone", "transfer.low=30", "transfer.high=180"]) == 0
+    assert "lies between" not in capsys.readouterr().out
+    assert main(["check", *words[:-1], "transfer.preset=bone"]) == 2  # beside the points of the file
+    assert "expected one of preset, file or points, got preset and points; 'transfer=" in capsys.readouterr().err
+
+
+def test_a_scan_of_which_nothing_is_visible_has_no_score(scan, tmp_path, capsys):
+    words = [*TINY, f"volume={scan}", "transfer={preset: bone, low: 900, high: 1800}", "--out", str(tmp_path / "dark")]
+    assert main(["run", *words]) == 0
+    told = capsys.readouterr().out
+    assert "Result     nothing of the volume is visible" in told
+    assert "ssim_in_focus" not in json.loads((tmp_path / "dark" / "summary.json").read_text())
 
 
 def test_a_preview_shows_the_volume_and_its_values(scan, tmp_path, capsys):
