@@ -262,13 +262,13 @@ def test_calibrate_does_not_write_over_a_file(capsys):
 
 
 def test_a_run_with_few_poses_says_what_to_look_at():
-    told = {"statuses": {"OK": 3, "INCONSISTENT": 4, "TOO_NARROW": 1}, "answered": 3, "frames": 8}
-    (line,) = refusals(told)
+    summary = {"statuses": {"OK": 3, "INCONSISTENT": 4, "TOO_NARROW": 1}, "answered": 3, "frames": 8}
+    (line,) = refusals(summary)
     assert line.startswith("Refused    most often INCONSISTENT: no pose explains the edges: are `edges`")
     assert not refusals({"statuses": {"OK": 5, "NO_AXIS": 4}, "answered": 5, "frames": 9})
     for status in Status:
-        told = {"statuses": {status.name: 2}, "answered": 0, "frames": 2}
-        assert len(refusals(told)) == (not status.answered)
+        summary = {"statuses": {status.name: 2}, "answered": 0, "frames": 2}
+        assert len(refusals(summary)) == (not status.answered)
 
 
 def free_port() -> int:

@@ -46,8 +46,8 @@ def test_a_preset_without_values_lies_between_air_and_the_brightest(scan, capsys
 def test_a_scan_of_which_nothing_is_visible_has_no_score(scan, tmp_path, capsys):
     words = [*TINY, f"volume={scan}", "transfer={preset: bone, low: 900, high: 1800}", "--out", str(tmp_path / "dark")]
     assert main(["run", *words]) == 0
-    told = capsys.readouterr().out
-    assert "Result     nothing of the volume is visible" in told
+    text = capsys.readouterr().out
+    assert "Result     nothing of the volume is visible" in text
     assert "ssim_in_focus" not in json.loads((tmp_path / "dark" / "summary.json").read_text())
 
 
