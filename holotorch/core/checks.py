@@ -208,7 +208,8 @@ def real(name: str, value: Tensor) -> None:
     wanted = "a real floating-point tensor"
     tensor(name, value, wanted)
     if not value.is_floating_point():
-        raise TypeError(f"{name} must be {wanted}, got {value.dtype}")
+        cure = "" if value.is_complex() else f"; give {name}.float()" + " / 255" * (value.dtype == torch.uint8)
+        raise TypeError(f"{name} must be {wanted}, got {value.dtype}{cure}")
 
 
 def all_finite(name: str, value: Tensor) -> None:

@@ -1,6 +1,7 @@
 """PECProblem: the squared difference between the image of a thermally coupled array and the target image."""
 
 import math
+import warnings
 from collections.abc import Callable
 
 import torch
@@ -10,6 +11,7 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity, phasor
 from holotorch.core.learning import fixed, without_graph
 
+_DIM, _BRIGHT = 0.5, 1.05  # means of a target outside of which it was hardly meant for an array of mean 1
 FRAMES_AT_ONCE = 1 << 23  # pixels of all frames above which each is propagated by itself, which then takes no longer
 
 
@@ -52,6 +54,9 @@ class PECProblem(nn.Module):
             that is negative somewhere or 0 in all of a channel; a negative weight; in a call: a phase or a target of
             another shape, or no target at all. The values of a target given in a call are not checked.
 
+    Warns:
+        SamplingWarning: ``target`` is brighter than the light of the array, or half as bright, and nothing scales it.
+
     Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; the transfer function is misplaced in print).
     """
 
@@ -88,6 +93,8 @@ class PECProblem(nn.Module):
                 *item, channel = black[0].tolist()
                 of = f" of item {tuple(item)}" if item else ""
                 raise ValueError(f"target channel {channel}{of} is black: there is no light to form, leave it out")
+            if mask is None and not scale_free:
+                _warn_of_brightness(target.flatten(-self.image_axes).mean(-1))
         fixed("mask", mask, "it is constant; give mask.detach()")
         self.crosstalk, self.propagator, self.scale_free = crosstalk, propagator, scale_free
         self.amplitude, self.frames = amplitude, frames
@@ -150,8 +157,11 @@ class PECProblem(nn.Module):
         self._check_axes(target)
         axes = 1 + self.image_axes
         if formed.shape[-axes:] != target.shape[-axes:]:
-            expected = "end in (C, H, W)" if axes == 3 else "give an image that ends in (C, *image)"
-            raise ValueError(f"phase must {expected} = {tuple(target.shape[-axes:])}, got {tuple(formed.shape)}")
+            ends = "(C, H, W)" if axes == 3 else "(C, *image)"
+            raise ValueError(
+                f"target must end in {ends} = {tuple(formed.shape[-axes:])}, as the image that the phase forms, got "
+                f"{tuple(target.shape)}"
+            )
         one, other = tuple(formed.shape[:-axes]), tuple(target.shape[:-axes])
         # torch.broadcast_shapes loads a computer algebra system first, in half a second.
         if any(a != b and 1 not in (a, b) for a, b in zip(reversed(one), reversed(other), strict=False)):
@@ -249,6 +259,19 @@ def check_target(target: Tensor, mask: Tensor | None, image_axes: int = 2) -> No
     if bool(empty.any()):
         raise ValueError(
             f"mask is zero everywhere in channel {int(empty.nonzero()[0][-1])}: nothing is left to compare"
+        )
+
+
+def _warn_of_brightness(means: Tensor) -> None:
+    """Warn if no array, whose pixels each emit light of 1, forms an image of these means [..., C]."""
+    dimmest, brightest = means.min().item(), means.max().item()
+    if dimmest < _DIM or brightest > _BRIGHT:
+        warnings.warn(
+            f"target has a mean of {dimmest if dimmest < _DIM else brightest:.3g} in a channel, but the light of an "
+            "array has a mean of 1 (less where some of it leaves the image): divide the target by its mean in each "
+            "channel, or give scale_free=True",
+            checks.SamplingWarning,
+            stacklevel=3,
         )
 
 

@@ -1,5 +1,6 @@
 """Names of bundled pictures and paths of configurations; without torch, which takes seconds to import."""
 
+import contextlib
 import difflib
 from pathlib import Path
 
@@ -8,8 +9,15 @@ BUNDLED_IMAGES = ("astronaut", "brick", "camera", "chelsea", "coffee", "coins", 
 
 
 def no_such_picture(source: str) -> str:
-    """Error message for a picture that is neither bundled nor a file; it suggests the most similar bundled name."""
+    """Error message for a picture that is neither bundled nor a file; it suggests the most similar name.
+
+    That is one of a bundled picture, or else of a file in the same folder.
+    """
     near = difflib.get_close_matches(source, BUNDLED_IMAGES, 1)
+    with contextlib.suppress(OSError, ValueError):  # no such folder, or a name that no file can have
+        path = Path(source)
+        files = [] if near else [each.name for each in path.parent.iterdir() if each.is_file()]
+        near += [str(path.with_name(name)) for name in difflib.get_close_matches(path.name, files, 1, cutoff=0.8)]
     hint = f"did you mean {near[0]!r}? " if near else ""
     shown = repr(source) if len(source) < 200 else f"{source[:200]!r}... ({len(source)} characters)"
     return f"no such picture: {shown}; {hint}give a path, or one of {', '.join(BUNDLED_IMAGES)}"

@@ -16,6 +16,7 @@ from holotorch.core.quantities import SIGMA_PX
 
 _SMALLEST_TAP = 1e-12  # smaller taps are set to 0: products with them may be denormal numbers, which are slow
 _ROOM = 1.5  # largest sigma for which a learnable kernel has enough taps, relative to the given one
+_METRES = 1e-3  # pixels; a smaller sigma spreads no heat and is likely in metres
 LOST_HEAT = 0.1  # share of heat outside a given number of taps that is too much; the thesis loses 8.7 % at sigma 2.5
 _TAPS_OF_FFT = 40  # taps per pixel, over both axes, above which FFTs are faster on a CPU (scripts/bench.py crosstalk)
 
@@ -42,7 +43,8 @@ class ThermalCrosstalk(PreciseModule):
             ``size`` even or below 1; in a call: an array smaller than the given ``size``.
 
     Warns:
-        SamplingWarning: ``size`` taps lose more than 10 % of the heat.
+        SamplingWarning: ``size`` taps lose more than 10 % of the heat, or ``sigma_px`` is above 0 but below 0.001,
+            which is likely a length in metres.
 
     Source: thesis Eqs. 4.2-4.4.
     """
@@ -67,6 +69,12 @@ class ThermalCrosstalk(PreciseModule):
         self.radius = _needed_radius(sigma * (_ROOM if self.learned else 1)) if size is None else size // 2
         self.patch = None
         self._keep_taps()
+        if 0 < sigma < _METRES:
+            warnings.warn(
+                f"sigma_px={sigma:g} lets no heat reach a neighbour; it is in pixels: divide a length by the pitch",
+                checks.SamplingWarning,
+                stacklevel=2,
+            )
         if size is not None and self.lost_heat > LOST_HEAT:
             enough = 2 * _needed_radius(sigma) + 1
             warnings.warn(

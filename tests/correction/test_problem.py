@@ -1,11 +1,14 @@
 """The objective and its gradient against closed forms with explicit matrices."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
 from oracles import dense, pec
 
 from holotorch import Grid
+from holotorch.core.checks import SamplingWarning
 from holotorch.correction import PECProblem
 from holotorch.correction import problem as problem_module
 from holotorch.correction.problem import best_scale
@@ -149,10 +152,23 @@ def test_unitary_propagation_keeps_the_mean_at_one():
         assert problem.intensity(torch.rand(1, *GRID.shape)).mean().item() == pytest.approx(1, rel=1e-5)
 
 
+@pytest.mark.parametrize("mean", [0.45, 2.0])
+def test_a_target_that_no_array_is_as_bright_as_is_warned_of(mean):
+    target = torch.full((2, *GRID.shape), 1.0)
+    target[1] = mean
+    with pytest.warns(SamplingWarning, match=f"target has a mean of {mean:g} in a channel"):
+        PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 2), target)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 2), target, scale_free=True)
+        PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 2), target, mask=torch.ones(1))
+        PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 2), target / target.mean((-2, -1), keepdim=True))
+
+
 @pytest.mark.parametrize("shape", [(3, 12, 1), (1, 12, 17), (3, 1, 17)])
 def test_a_target_of_another_shape_is_not_broadcast(shape):
     problem = PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 3), torch.ones(shape))
-    with pytest.raises(ValueError, match=rf"phase must end in \(C, H, W\) = \({shape[0]}, {shape[1]}, {shape[2]}\)"):
+    with pytest.raises(ValueError, match=r"target must end in \(C, H, W\) = \(3, 12, 17\)"):
         problem(torch.rand(3, *GRID.shape))
 
 

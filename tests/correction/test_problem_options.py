@@ -147,7 +147,9 @@ def test_frames_need_their_axis(shape):
 
 def test_a_target_of_several_depths_needs_an_image_of_them():
     stack = DepthStack([Fresnel(GRID, WAVES, z, pad=1) for z in DISTANCES])
-    with pytest.raises(ValueError, match=r"give an image that ends in \(C, \*image\) = \(2, 3, 6, 7\)"):
+    with pytest.raises(
+        ValueError, match=r"target must end in \(C, \*image\) = \(2, 2, 6, 7\), as .* got \(2, 3, 6, 7\)"
+    ):
         PECProblem(CROSSTALK, stack, torch.ones(2, 3, 6, 7))(torch.rand(2, 6, 7))
     with pytest.raises(ValueError, match=r"target must have axes \(..., C, D, H, W\), got \(2, 6, 5\)"):
         PECProblem(CROSSTALK, stack, torch.ones(2, 6, 5))

@@ -98,8 +98,8 @@ def _received(folder: Path) -> None:
     for path in sorted(folder.glob("*.bin"), key=lambda path: int(path.stem)):
         time[0] += 0.02
         receiver.datagram_received(path.read_bytes(), _SENDER)
-        newest = receiver.latest()
-        assert newest is None or (newest.answered and 0 <= receiver.age() <= receiver.oldest)
+        age, newest = receiver.age(), receiver.latest()  # in this order: time passes between them
+        assert newest is None or (newest.answered and 0 <= age <= receiver.oldest)
         _told(receiver)
     invalid, last = receiver.statistics.invalid, receiver.statistics.last_error
     # Five, as a sender's own clock is compared while it sends: three are needed to be followed.

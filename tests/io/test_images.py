@@ -104,6 +104,9 @@ def test_refuses_black_tiny_missing_and_garbled_pictures(tmp_path):
         load_image(tmp_path / "tiny.png")
     with pytest.raises(ValueError, match="no such picture: 'cofee'; did you mean 'coffee'?"):
         load_image("cofee")
+    near = tmp_path / "black.pgn"
+    with pytest.raises(ValueError, match=rf"no such picture: '{near}'; did you mean '{tmp_path / 'black.png'}'?"):
+        load_image(near)
     for name in ("text.png", "text.exr", "empty.png"):
         (tmp_path / name).write_bytes(b"" if name == "empty.png" else b"not a picture")
         with pytest.raises(ValueError, match="is not a readable"):

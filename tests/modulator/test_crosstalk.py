@@ -151,3 +151,9 @@ def test_taps_that_cut_the_kernel_are_said():
         warnings.simplefilter("error")
         assert ThermalCrosstalk(3.0, 23).lost_heat < 1e-5 < cut.lost_heat
         ThermalCrosstalk(2.5, 7)  # the thesis's largest sigma
+
+
+def test_a_width_in_metres_is_warned_of():
+    with pytest.warns(SamplingWarning, match="sigma_px=6e-06 lets no heat reach a neighbour; it is in pixels"):
+        ThermalCrosstalk(6e-6)
+    assert ThermalCrosstalk(0.0).total == 1

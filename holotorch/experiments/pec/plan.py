@@ -100,7 +100,7 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     colours = "grey" if len(experiment.lit) == 1 else "colour"
     wavelengths = ", ".join(f"{wavelength * 1e9:.4g} nm" for wavelength in experiment.wavelengths)
     lines = [
-        f"Picture    {settings.target.image}, {colours}, on {height} x {width} px",
+        f"Picture    {settings.target.image}, {colours}, on {height} x {width} px{_framing(experiment)}",
         f"Array      {physics['width_mm']:.4g} x {physics['height_mm']:.4g} mm (width x height)",
         _crosstalk_line(crosstalk),
         f"Light      {wavelengths}; field of view {_listed(physics['field_of_view_deg'], '.2f')} deg across",
@@ -166,6 +166,7 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
     return values | {"fitted_sigma_px": fitted.sigma_px, "fit_residual": residual}
 
 
+_SAME_ASPECT = 0.01  # relative change of an aspect ratio that nobody sees
 _NO_GAUSSIAN = 0.05  # rest of a fit above which corrections for the Gaussian lose much of their gain
 
 
@@ -184,6 +185,20 @@ def _crosstalk_line(values: dict[str, Any]) -> str:
         f"Crosstalk  heat spreads with sigma {values['sigma_px']:g} px over {values['taps']} taps "
         f"({values['reason']}): {SIGMA_MEANING}"
     )
+
+
+def _framing(experiment: PECExperiment) -> str:
+    """Words on a picture whose aspect ratio is changed, empty for another."""
+    target, (height, width) = experiment.settings.target, experiment.source.shape[-2:]
+    rows, columns = target.region or experiment.grid.shape
+    if abs(math.log(width * rows / (height * columns))) < _SAME_ASPECT:
+        return ""
+    wide = width * rows > height * columns
+    if target.fit == "pad":
+        how = f"padded with black {'above and below' if wide else 'on both sides'}"
+    else:
+        how = f"cropped {'on both sides' if wide else 'above and below'}; target.fit=pad shows all of it"
+    return f"; of {height} x {width} px, {how}"
 
 
 def _listed(values: list[float], form: str = ".3g") -> str:

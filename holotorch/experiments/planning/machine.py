@@ -79,7 +79,7 @@ class Machine:
 
 def seconds_in_words(seconds: dict[str, float]) -> str:
     """Parts of predicted seconds for the line of a plan."""
-    return ", ".join(f"{value:.2g} s {name}" for name, value in seconds.items())
+    return "on an idle machine: " + ", ".join(f"{value:.2g} s {name}" for name, value in seconds.items())
 
 
 _known: dict[str, Machine] = {}  # by name of the file

@@ -61,7 +61,13 @@ def _count(text: str) -> int:
 def _stream(options: argparse.Namespace) -> int:
     options.view = options.view or any(getattr(options, name) is not None for name in _OF_PAGE)
     if options.replay:
-        options.sources = [*options.sources, str(_poses_of(options.replay))]
+        if options.sources:
+            from holotorch.experiments.config.errors import ConfigError
+
+            raise ConfigError(
+                [f"--replay {options.replay} is the source itself: leave {' '.join(options.sources)} out"]
+            )
+        options.sources = [str(_poses_of(options.replay))]
     if options.check or (options.view and not options.sources):
         _need_no_source(options)
     if options.check:
@@ -130,6 +136,7 @@ def _send(options: argparse.Namespace) -> int:
         headset=options.headset,
         igtl=options.igtl,
         page=page,
+        await_browser=not (options.to or options.replay or options.igtl is not None),
         repeat=options.replay is not None,
         rate=options.rate,
         smooth=options.smooth,

@@ -149,6 +149,7 @@ def stream(
     headset: Path | None = None,
     igtl: int | None = None,
     page: "PageServer | None" = None,
+    await_browser: bool = False,
     rate: float | None = None,
     repeat: bool = False,
     smooth: bool = False,
@@ -165,6 +166,7 @@ def stream(
         igtl: Port of an OpenIGTLink server, to which Slicer connects; None for no server.
         page: Server of a page that shows the poses in a browser; it opens and closes with the stream. Beside a
             poses.csv, it shows the frames that the run has recorded.
+        await_browser: Begin when the first browser opens the page.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
         repeat: Begin a poses.csv again at its end, until the user interrupts the stream.
         smooth: Smooth the poses by :class:`OneEuro`; the packets then state the lag of the filter.
@@ -200,7 +202,7 @@ def stream(
     pages = [] if page is None else [(page.aligner or frames[headset], page)]
     count, complete = [0], True
     try:
-        asyncio.run(_send(iter(poses), [*senders, *pages], servers, smooth, count, show))
+        asyncio.run(_send(iter(poses), [*senders, *pages], servers, smooth, count, show, await_browser=await_browser))
     except KeyboardInterrupt:
         show("interrupted")
         complete = False
@@ -247,6 +249,8 @@ async def _send(
     smooth: bool,
     count: list[int],
     show: Show,
+    *,
+    await_browser: bool,
 ) -> None:
     """Send all poses; ``count[0]`` becomes the number of poses sent, even if the call is interrupted."""
     links = [link for _, sender in senders if isinstance(sender, PoseSender) for link in sender.links]
@@ -261,6 +265,10 @@ async def _send(
             show(f"Frame      {frame.name}{'' if frame.covariance is not None else ', of unknown accuracy'}")
         for _, server in servers:
             show(f"Slicer     connects to {own_address()}, port {server.port}")
+        if await_browser and pages:
+            show("Waiting    for a browser that opens the page")
+            while not any(page.clients for page in pages):
+                await asyncio.sleep(0.05)
         try:
             # Tracking runs in a thread, so that clock requests are answered in the meantime.
             while (item := await asyncio.to_thread(next, poses, None)) is not None:

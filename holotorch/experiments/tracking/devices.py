@@ -132,6 +132,10 @@ def _load(
     needed = ", ".join(name for name, field in model.model_fields.items() if field.is_required())
     kind = model.__name__.removesuffix("Settings").lower()
     source = read_source(Path(path), list(overrides), f"the settings of a {kind}: {needed}")
+    for other in (CameraSettings, CatheterSettings, HeadsetSettings):
+        if other is not model and set(source.data) and set(source.data) <= set(other.model_fields):
+            given = other.__name__.removesuffix("Settings").lower()
+            raise ConfigError([f"{path}: this is the file of a {given}, but that of a {kind} is expected ({needed})"])
     settings = validated(source, model)
     try:
         build(settings)

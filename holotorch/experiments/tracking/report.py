@@ -167,9 +167,9 @@ def verdict(summary: dict[str, Any]) -> str:
 
 
 def refusals(summary: dict[str, Any]) -> list[str]:
-    """A line with the commonest refusal and what to look at, if half of the frames or more have no pose."""
+    """A line with the commonest refusal and what to look at, if a quarter of the frames or more have no pose."""
     counts = {name: count for name, count in summary["statuses"].items() if not Status[name].answered}
-    if not counts or 2 * summary["answered"] > summary["frames"]:
+    if not counts or 4 * summary["answered"] > 3 * summary["frames"]:
         return []
     commonest = max(counts, key=lambda name: counts[name])
     return [f"Refused    most often {commonest}: {_ADVICE[Status[commonest]]}"]

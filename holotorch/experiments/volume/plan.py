@@ -23,6 +23,7 @@ _CALL_SECONDS = 0.015  # seconds to plan the refocusing of a field
 _PICTURE_SECONDS = 2.4e-6  # seconds to score a pixel of a picture, encode it and draw it in a figure
 _BASE_BYTES = 410e6  # memory of the libraries
 _RAY_BYTES = 120  # memory of the renderer per ray
+_FEW_VALUES = 0.01  # share of the range of a volume below which points hardly lie among its values
 _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
@@ -180,10 +181,27 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
         )
     if words := preset_note(experiment):
         notes.append(words)
+    notes += _other_values(experiment)
     lost = _lost_light(experiment)
     if lost > 0.005:
         notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
     return notes
+
+
+def _other_values(experiment: VolumeExperiment) -> list[str]:
+    """A note if the points of the transfer function hardly lie among the values of the volume."""
+    points, values = experiment.settings.transfer.points, experiment.volume.values
+    if points is None:
+        return []
+    first, last = min(point[0] for point in points), max(point[0] for point in points)
+    least, largest = float(values.min()), float(values.max())
+    common = min(last, largest) - max(first, least)
+    if 2 * common >= last - first and common >= _FEW_VALUES * (largest - least):
+        return []
+    return [
+        f"the points of the transfer function lie between {first:g} and {last:g}, the values of this volume between "
+        f"{least:g} and {largest:g}: are they meant for this file? transfer=bone takes its values from the histogram"
+    ]
 
 
 def _beside_the_scene(experiment: VolumeExperiment) -> list[str]:

@@ -257,6 +257,33 @@ def test_a_stream_is_shown_on_a_page(tmp_path):
     assert seen[0]["camera"]["fx"] == 800 and [message["answered"] for message in seen[1:]] == [True] * 4
 
 
+def test_a_stream_for_a_page_alone_begins_with_the_first_browser(tmp_path):
+    server = replayed(tmp_path, [pose(1e-3 * i) for i in range(5)])
+    server.port, events = 0, []
+
+    async def watch():
+        async with aiohttp.ClientSession() as session:
+            await asyncio.sleep(0.3)
+            events.append("browser")
+            async with session.ws_connect(server.address + "poses") as socket:
+                await socket.receive_str()
+                async for _ in socket:  # until the stream ends
+                    pass
+
+    send, waiting = server.send, threading.Event()
+    server.send = lambda *words, **names: events.append("pose") or send(*words, **names)
+    watcher = threading.Thread(target=lambda: waiting.wait(20) and asyncio.run(watch()), daemon=True)
+    watcher.start()
+
+    def show(line: str) -> None:
+        if line == "Waiting    for a browser that opens the page":
+            waiting.set()
+
+    options = {"page": server, "await_browser": True, "rate": 200, "show": show}
+    assert stream([str(tmp_path / "poses.csv")], **options).complete
+    assert events == ["browser", *["pose"] * 5]
+
+
 def test_the_command_replays_a_run_on_a_page_until_it_is_interrupted(tmp_path, monkeypatch, capsys):
     given = {}
 

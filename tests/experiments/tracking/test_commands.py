@@ -265,7 +265,7 @@ def test_a_run_with_few_poses_says_what_to_look_at():
     summary = {"statuses": {"OK": 3, "INCONSISTENT": 4, "TOO_NARROW": 1}, "answered": 3, "frames": 8}
     (line,) = refusals(summary)
     assert line.startswith("Refused    most often INCONSISTENT: no pose explains the edges: are `edges`")
-    assert not refusals({"statuses": {"OK": 5, "NO_AXIS": 4}, "answered": 5, "frames": 9})
+    assert not refusals({"statuses": {"OK": 7, "NO_AXIS": 2}, "answered": 7, "frames": 9})
     for status in Status:
         summary = {"statuses": {status.name: 2}, "answered": 0, "frames": 2}
         assert len(refusals(summary)) == (not status.answered)
@@ -324,6 +324,13 @@ def test_stream_of_a_video_takes_a_camera_and_a_catheter(capsys):
     assert "no camera.yaml: say which with --camera" in said(capsys, "stream", ".", *to)
     assert "no catheter.yaml: say which with --catheter" in said(capsys, "stream", ".", *FILES[:2], *to)
     assert "expected one source to track and stream, got 2" in said(capsys, "stream", "a.mp4", "b.mp4", *FILES, *to)
+    words = ["--replay . is the source itself: leave a.mp4 out"]
+    assert said(capsys, "stream", "a.mp4", "--replay", ".").splitlines() == words
+    swapped = ["--camera", FILES[3], "--catheter", FILES[3]]
+    error = said(capsys, "stream", ".", *swapped, *to)
+    assert f"{FILES[3]}: this is the file of a catheter, but that of a camera is expected (fx, fy, cx, cy)" in error
+    error = said(capsys, "stream", ".", *FILES[:2], "--catheter", FILES[1], *to)
+    assert f"{FILES[1]}: this is the file of a camera, but that of a catheter is expected (edges, colours" in error
     assert "nowhere.mp4" in said(capsys, "stream", "nowhere.mp4", *FILES, *to)
     assert "none.yaml" in said(capsys, "stream", ".", "--camera", "none.yaml", *FILES[2:], *to)
 

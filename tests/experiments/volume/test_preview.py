@@ -43,6 +43,18 @@ def test_a_preset_without_values_lies_between_air_and_the_brightest(scan, capsys
     assert "expected one of preset, file or points, got preset and points; 'transfer=" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "noted"), [(100, 255, False), (900, 1800, True), (20, 30, False), (20, 22, True), (-900, 40, True)]
+)
+def test_points_that_are_meant_for_another_scan_are_noted(scan, capsys, low, high, noted):
+    transfer = f"transfer={{points: [[{low}, 1, 1, 1, 0], [{high}, 1, 1, 1, 0.5]]}}"
+    assert main(["check", *TINY, f"volume={scan}", transfer]) == 0
+    words = (
+        f"the points of the transfer function lie between {low} and {high}, the values of this volume between 20 and"
+    )
+    assert (words in capsys.readouterr().out) is noted
+
+
 def test_a_scan_of_which_nothing_is_visible_has_no_score(scan, tmp_path, capsys):
     words = [*TINY, f"volume={scan}", "transfer={preset: bone, low: 900, high: 1800}", "--out", str(tmp_path / "dark")]
     assert main(["run", *words]) == 0
