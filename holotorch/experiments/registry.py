@@ -33,7 +33,7 @@ def find_kind(name: str) -> ExperimentKind[Any, Any]:
 def run_name(config: Path | str, overrides: list[str], kind: str) -> str:
     """The name of a run's default folder: that of the user's data in ``overrides``, otherwise of the configuration.
 
-    Data of a file in a format that holds several, such as "a.h5::ct", have the name of the file.
+    The kind follows the name of data, which runs of several kinds may show: "head-eye". Data of a file in a format that holds several, such as "a.h5::ct", have the name of the file.
     """
     given = Source(Path(config), {})
     for word in overrides:
@@ -44,7 +44,8 @@ def run_name(config: Path | str, overrides: list[str], kind: str) -> str:
     path = Path(value.split("::")[0]) if isinstance(value, str) else None
     if path is None or not path.exists():  # such as the name of a bundled picture
         return Path(config).stem
-    return path.resolve().name if path.is_dir() else path.stem.removesuffix(".nii")
+    name = path.resolve().name if path.is_dir() else path.stem.removesuffix(".nii")
+    return f"{name}-{kind}"
 
 
 def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:

@@ -115,13 +115,13 @@ def test_every_kind_has_settings_of_its_own_name(name):
 @pytest.mark.parametrize(
     ("config", "word", "name"),
     [
-        ("pec/fourier.yaml", "target.image=my photo.png", "my photo"),
-        ("pec/fourier.yaml", "target={image: my photo.png}", "my photo"),
+        ("pec/fourier.yaml", "target.image=my photo.png", "my photo-pec"),
+        ("pec/fourier.yaml", "target={image: my photo.png}", "my photo-pec"),
         ("pec/fourier.yaml", "target.image=coffee", "fourier"),  # a bundled picture is not the user's own
-        ("volume/c60.yaml", "volume.path=head.v2.nii.gz", "head.v2"),
-        ("volume/c60.yaml", "volume.path=ct.h5::a/b", "ct"),
-        ("eye/teapot.yaml", "volume={path: slices/}", "slices"),
-        ("joint/teapot.yaml", "volume.path=.", "work"),
+        ("volume/c60.yaml", "volume.path=head.v2.nii.gz", "head.v2-volume"),
+        ("volume/c60.yaml", "volume.path=ct.h5::a/b", "ct-volume"),
+        ("eye/teapot.yaml", "volume={path: slices/}", "slices-eye"),
+        ("joint/teapot.yaml", "volume.path=.", "work-joint"),
         ("joint/teapot.yaml", "steps=3", "teapot"),
         ("tracking/track.yaml", "source=my photo.png", "track"),
         ("perception/layout.yaml", "seed=3", "layout"),
@@ -145,7 +145,7 @@ def test_the_folder_of_a_run_has_the_name_of_the_picture_that_it_shows(tmp_path,
     for number in (1, 2):
         assert main(["run", str(CONFIGS / "pec" / "fourier.yaml"), *words]) == 0
         out = capsys.readouterr().out.splitlines()
-        assert out[0].startswith("Picture    mine.png") and out[-1] == f"runs/mine-00{number}/report.html"
-    assert "<title>holotorch: mine-002</title>" in (tmp_path / out[-1]).read_text()
+        assert out[0].startswith("Picture    mine.png") and out[-1] == f"runs/mine-pec-00{number}/report.html"
+    assert "<title>holotorch: mine-pec-002</title>" in (tmp_path / out[-1]).read_text()
     assert main(["run", str(CONFIGS / "pec" / "fourier.yaml"), *words, "--out", "there"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "there/report.html"
