@@ -33,7 +33,8 @@ def find_kind(name: str) -> ExperimentKind[Any, Any]:
 def run_name(config: Path | str, overrides: list[str], kind: str) -> str:
     """The name of a run's default folder: that of the user's data in ``overrides``, otherwise of the configuration.
 
-    The kind follows the name of data, which runs of several kinds may show: "head-eye". Data of a file in a format that holds several, such as "a.h5::ct", have the name of the file.
+    The kind follows the name of data, which runs of several kinds may show: "head-eye". Data of a file in a format that
+    holds several, such as "a.h5::ct", have the name of the file.
     """
     given = Source(Path(config), {})
     for word in overrides:

@@ -6,6 +6,7 @@ from typing import Any
 from holotorch.experiments.eye import geometry as eye_geometry
 from holotorch.experiments.eye.experiment import RETINA, Observer
 from holotorch.experiments.planning.colours import colours_in_words
+from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.runs.memory import shortage
 from holotorch.experiments.runs.page import plain
@@ -157,7 +158,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         f"Phases     {settings.seeds} realisation(s) of the random phases, compared with the mean of "
         f"{8 * settings.seeds} others",
         eye.budget.text,
-        f"Cost       about {values['predicted_seconds']:.2g} s for {values['images']} images "
+        f"Cost       about {duration(values['predicted_seconds'])} for {values['images']} images "
         f"({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]

@@ -9,6 +9,7 @@ from holotorch.experiments.joint.budget import PATIENCE, stop
 from holotorch.experiments.joint.config import REFERENCE, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
+from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.volume.plan import dark_picture
 from holotorch.optics.light.coherence import depth_of_focus
@@ -72,7 +73,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the pupil",
         f"Solver     {_steps(values, experiment)}; compared with {', '.join(settings.report.baselines) or 'nothing'}",
         f"{experiment.budget.text}; {values['taps']} taps, {values['precision']} in the solver",
-        f"Cost       about {values['predicted_seconds']:.2g} s ({seconds_in_words(values['seconds_of'])}); "
+        f"Cost       about {duration(values['predicted_seconds'])} ({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     return "\n".join(lines + [f"Note       {note}" for note in values["notes"]])

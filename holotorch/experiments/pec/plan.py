@@ -12,6 +12,7 @@ from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import evaluations, padded_samples, seconds_of
 from holotorch.experiments.planning.colours import colours_in_words
+from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
@@ -135,9 +136,9 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         f"{values['start']['kind']} start ({values['start']['reason']}); it stops after {settings.solver.patience} "
         f"changes of the loss below {values['stop_below']:.1e} of it",
         f"{experiment.budget.text}; {values['precision']}",
-        f"Cost       at most about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s "
-        f"({seconds_in_words(values['seconds_of'])}), {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the "
-        "peak",
+        f"Cost       at most about {values['predicted_evaluations']} evaluations, "
+        f"{duration(values['predicted_seconds'])} ({seconds_in_words(values['seconds_of'])}), "
+        f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     lines += [f"Note       {note}" for note in values["notes"]]
     return "\n".join(lines)

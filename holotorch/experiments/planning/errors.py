@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from holotorch.experiments.planning.duration import duration
+
 # Longest time of a measurement, in seconds on the reference machine of ``machine``: every machine measures the same.
 LIMIT = 30.0
 
@@ -29,7 +31,7 @@ class Comparison:
 
 def not_measured(part: str, predicted: float, seconds: float) -> Comparison:
     """A part whose reference is not affordable; ``seconds`` is its predicted time."""
-    return Comparison(part, predicted, None, f"not measured: reference would take {seconds:.2g} s")
+    return Comparison(part, predicted, None, f"not measured: reference would take {duration(seconds)}")
 
 
 def error_values(comparisons: Sequence[Comparison]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ import torch
 
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import fft2
+from holotorch.experiments.planning.duration import duration
 from holotorch.io.files import cache_folder, read_json, write_json
 
 _VERSION = 1  # of the file; raised when a measurement or a reference time changes
@@ -79,7 +80,7 @@ class Machine:
 
 def seconds_in_words(seconds: dict[str, float]) -> str:
     """Parts of predicted seconds for the line of a plan."""
-    return "on an idle machine: " + ", ".join(f"{value:.2g} s {name}" for name, value in seconds.items())
+    return "on an idle machine: " + ", ".join(f"{duration(value)} {name}" for name, value in seconds.items())
 
 
 _known: dict[str, Machine] = {}  # by name of the file

@@ -9,6 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.registry import find_kind, load_config
 from holotorch.experiments.report import outcome_lines
 from holotorch.experiments.runs.fingerprint import differences, fingerprint
@@ -33,7 +34,7 @@ def check_sweep(config: str, arguments: Sequence[str]) -> str:
         shortages += [plan.shortage] if plan.shortage else []
     if shortages:
         raise ConfigError(list(dict.fromkeys(shortages)))
-    cost = f"about {max(1, sum(times)):.3g} s one after the other" if times else "the time is not predicted"
+    cost = f"about {duration(max(1, sum(times)))} one after the other" if times else "the time is not predicted"
     most = f"; at most {memory / 1e9:.2g} GB of memory for each" if memory else ""
     swept = ", ".join(f"{key} ({len({point.values[key] for point in grid})})" for key in grid[0].values)
     return f"{len(grid)} runs of {config} over {swept}: {cost}{most}"

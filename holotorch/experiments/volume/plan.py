@@ -8,6 +8,7 @@ import torch
 
 from holotorch.core.grid import Grid
 from holotorch.experiments.planning.colours import colours_in_words
+from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import Machine, machine_speed, seconds_in_words
 from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.experiments.volume.report import EDGES, METHODS
@@ -137,7 +138,7 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     lines += [
         experiment.budget.text,
         f"Precision  {values['precision']}",
-        f"Cost       about {values['predicted_seconds']:.2g} s for {settings.report.seeds} realisation(s) of the "
+        f"Cost       about {duration(values['predicted_seconds'])} for {settings.report.seeds} realisation(s) of the "
         f"random phases ({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]

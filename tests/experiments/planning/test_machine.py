@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from holotorch.experiments.planning import machine
+from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import Machine, machine_speed, speed_file
 
 
@@ -81,3 +82,19 @@ def test_a_real_measurement_is_plausible_and_leaves_random_numbers_alone():
 def test_importing_holotorch_measures_nothing():
     code = "import holotorch, holotorch.optics, sys; assert not any('planning.machine' in m for m in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0.0, "0 s"),
+        (0.023, "0.023 s"),
+        (99.4, "99 s"),
+        (100, "1.7 min"),
+        (5900, "98 min"),
+        (6000, "1.7 h"),
+        (4e5, "111 h"),
+    ],
+)
+def test_durations_have_two_digits_in_a_fitting_unit(seconds, words):
+    assert duration(seconds) == words
