@@ -195,9 +195,11 @@ def json_mutated(rng: Random, text: bytes, other: bytes) -> bytes:
             rng, text, other, (b"[" * 100_000, b'{"a":' * 100_000, b"1e999", b"NaN", b"-Infinity", b"\\ud800")
         )
     try:
-        return json.dumps(
-            tree_mutated(rng, json.loads(text), json.loads(other)), ensure_ascii=rng.random() < 0.5
-        ).encode("utf-8", "surrogatepass")
+        tree = tree_mutated(rng, json.loads(text), json.loads(other))
+        made, parts = bytearray(), json.JSONEncoder(ensure_ascii=rng.random() < 0.5).iterencode(tree)
+        while len(made) < FULL and (part := next(parts, None)) is not None:  # borrowed parts may hold each other
+            made += part.encode("utf-8", "surrogatepass")
+        return bytes(made)
     except RecursionError:
         return b"[" * 100_000
 
