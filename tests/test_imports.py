@@ -10,9 +10,8 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
-from paths import ROOT
+from paths import PACKAGE, ROOT
 
-PACKAGE = ROOT / "holotorch"
 FILES = sorted(PACKAGE.rglob("*.py"))
 # Rooms of a package: each may use those after it; names on one level do not import each other.
 ROOMS = {
@@ -59,7 +58,7 @@ class Source:
 
 
 def module_of(path: Path) -> str:
-    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 

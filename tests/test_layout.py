@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 from apart import printed_by
-from paths import ROOT
+from paths import PACKAGE, ROOT
 
-PACKAGE = ROOT / "holotorch"
 # Each level may use those after it and itself; names on one level do not import each other.
 LEVELS = [
     {"__main__"},
@@ -167,7 +166,7 @@ def test_pages_name_files_that_exist_and_commands_that_parse(page):
     for path in re.findall(
         r"(?<![./\w])(?:configs|scripts|tests|holotorch)/[\w/.-]+\.(?:yaml|sh|png|py|txt|csv)", text
     ):
-        assert (ROOT / path).is_file(), path
+        assert ((PACKAGE.parent if path.startswith("holotorch/") else ROOT) / path).is_file(), path
     for link in re.findall(r"\]\(([^):]+)\)", text):
         assert (page.parent / link.partition("#")[0]).is_file(), link
     from holotorch.cli import _parser

@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from holotorch.experiments.config.errors import ConfigError, short
-from holotorch.experiments.config.source import MOST_MISTAKES, Key, Source
+from holotorch.experiments.config.errors import MOST_MISTAKES, ConfigError, short
+from holotorch.experiments.config.source import Key, Source
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -34,9 +34,7 @@ def validated(source: Source, model: type[Model]) -> Model:
         entries = error.errors()
         listed = entries[:MOST_MISTAKES]
         mistakes = dict.fromkeys(describe(source, model, e) for e in listed if not _follows(e, listed))
-        left = len(entries) - MOST_MISTAKES
-        more = [f"{source.path}: and {left} more mistakes"] if left > 0 else []
-        raise ConfigError([*sorted(mistakes, key=position), *more]) from None
+        raise ConfigError(sorted(mistakes, key=position), len(entries) - len(listed)) from None
 
 
 def _follows(entry: Any, others: list[Any]) -> bool:

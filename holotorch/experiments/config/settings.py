@@ -58,6 +58,9 @@ def radians(value: Any) -> Any:
     return number(value)
 
 
+_LARGEST = 10**300  # whole numbers that become floats; the largest float is 1.8e308
+
+
 def kelvin(value: Any) -> Any:
     """A temperature rise in kelvin, from a number of them or a text such as 500 degC or 500 K."""
     if isinstance(value, str):
@@ -69,9 +72,11 @@ def kelvin(value: Any) -> Any:
 
 
 def number(value: Any) -> Any:
-    """The value itself; an error for true and false, which Python takes as numbers."""
+    """The value itself; an error for true and false, which Python takes as numbers, and for what no float can be."""
     if isinstance(value, bool):
         raise PydanticCustomError("number", "expected a number")
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        raise PydanticCustomError("number", "expected a number of at most 300 digits")
     return value
 
 

@@ -14,7 +14,6 @@ _MAX_BYTES = 1 << 17  # limit for a file; parsing that many bytes takes up to 4 
 _MAX_VALUES = 100_000  # a file of _MAX_BYTES can have more values only through YAML aliases
 _MAX_DEPTH = 50  # levels of nested keys; configurations have fewer than ten
 _BY_NAME = {"transfer": "preset"}  # sections that may be given as the value of one of their keys
-MOST_MISTAKES = 50  # limit for the number of mistakes that are listed
 
 
 @dataclass
@@ -62,8 +61,7 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
         problem = f"the file is empty; expected {wanted}" if data is None else f"expected {wanted}, got {short(data)}"
         mistakes.append(f"{path}:1:1: {problem}")
     if mistakes:
-        more = [f"{path}: and {len(mistakes) - MOST_MISTAKES} more mistakes"] if len(mistakes) > MOST_MISTAKES else []
-        raise ConfigError([*mistakes[:MOST_MISTAKES], *more])
+        raise ConfigError(mistakes)
     return source
 
 
