@@ -7,6 +7,7 @@ import warnings
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 from torch.nn import functional
 
 from holotorch.core import checks
@@ -263,8 +264,10 @@ class _ShiftAndAdd(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx, inputs, output):
         image, taps = inputs
+        # The image is kept where the derivative with respect to the taps needs it, and freed elsewhere.
         ctx.save_for_backward(image if taps.requires_grad else None, taps)
-        ctx.save_for_forward(image, taps)
+        forward_mode = getattr(forward_ad, "_current_level", 0) >= 0  # as forward_ad itself asks
+        ctx.save_for_forward(image if forward_mode else None, taps)
 
     @staticmethod
     def backward(ctx, *gradients: Tensor):

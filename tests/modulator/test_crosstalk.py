@@ -157,3 +157,16 @@ def test_a_width_in_metres_is_warned_of():
     with pytest.warns(SamplingWarning, match="sigma_px=6e-06 lets no heat reach a neighbour; it is in pixels"):
         ThermalCrosstalk(6e-6)
     assert ThermalCrosstalk(0.0).total == 1
+
+
+def test_forward_mode_in_sigma_and_phase_is_the_central_difference():
+    module, phase = ThermalCrosstalk(0.66, 7, learnable=True), torch.rand(2, 9, 11, dtype=torch.float64)
+
+    def spread(sigma, phase):
+        return torch.func.functional_call(module, {"sigma": sigma}, (phase,))
+
+    sigma, step = torch.tensor(0.7, dtype=torch.float64), 1e-6
+    got = torch.func.jvp(spread, (sigma, phase), (torch.ones_like(sigma), torch.sin(phase)))[1]
+    ends = [spread(sigma + sign * step, phase + sign * step * torch.sin(phase)) for sign in (1, -1)]
+    # The values are below 5, and the third derivatives below 100.
+    torch.testing.assert_close(got, (ends[0] - ends[1]) / (2 * step), rtol=0, atol=5 * 2e-16 / step + 100 * step**2 / 6)
