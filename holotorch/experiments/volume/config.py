@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from holotorch.core.quantities import WIDTH
+from holotorch.core.quantities import DEPTH, WIDTH
 from holotorch.experiments.config.settings import (
     Count,
     Distance,
@@ -213,6 +213,11 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     if isinstance(hologram.depths, int) and hologram.distance <= width / 2:
         hint = f"a volume {width:.3g} m wide needs more than {width / 2:.3g} m"
         problems.append((("hologram", "distance"), f"expected the whole volume in front of the hologram; {hint}"))
+    lengths = (hologram.distance, *(hologram.depths if isinstance(hologram.depths, tuple) else ()))
+    if min(lengths) / settings.scale < DEPTH.low:
+        by = f" divided by the scale {settings.scale}" if settings.scale > 1 else ""
+        wanted = f"expected distances of at least {DEPTH.low:g} m, got {min(lengths):g} m{by}"
+        problems.append((("hologram", "distance"), wanted))
     least = min(side) // settings.scale
     if least < 8 or any(size % settings.scale for size in side) or (rays is not None and rays % settings.scale):
         problems.append((("scale",), f"expected a divisor of the pixels {side} and the rays that leaves at least 8"))

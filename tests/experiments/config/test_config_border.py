@@ -165,6 +165,18 @@ def test_planes_at_one_distance_are_a_mistake_of_their_key():
         load_config(Path("configs/volume/c60.yaml"), ["hologram.depths=[4 mm, 5 mm, 4 mm]"])
 
 
+@pytest.mark.parametrize(
+    ("words", "got"),
+    [
+        (["hologram.depths=[4 mm, 5 mm]", "hologram.distance=1e-300"], "got 1e-300 m"),
+        (["hologram.depths=[4 mm, 2 nm]", "scale=4"], "got 2e-09 m divided by the scale 4"),
+    ],
+)
+def test_planes_at_the_hologram_are_a_mistake(words, got):
+    with pytest.raises(ConfigError, match=f"hologram.distance: expected distances of at least 1e-09 m, {got}"):
+        load_config(Path("configs/volume/c60.yaml"), words)
+
+
 STUDY = "experiment: pec_study\nstudy: lowpass\nimages: [camera]\nsweep: [0.1]\n"
 ANALYSIS = "experiment: perception_analysis\ntargets: [{seconds: 0.45}]\n"
 
