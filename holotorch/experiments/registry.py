@@ -4,7 +4,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.errors import ConfigError, short
 from holotorch.experiments.config.messages import nearest, validated
 from holotorch.experiments.config.source import Source, override, read_source
 from holotorch.experiments.config.version import upgraded
@@ -58,7 +58,11 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     source = upgraded(read_source(find_config(path) or Path(path), overrides or []))
     name = source.data.get("experiment")
     if not isinstance(name, str) or name not in KINDS:
-        got = f"got {name!r}" + nearest(str(name), list(KINDS)) if "experiment" in source.data else "it is missing"
+        got = (
+            f"got {short(name)}" + nearest(str(name)[:100], list(KINDS))
+            if "experiment" in source.data
+            else "it is missing"
+        )
         raise ConfigError([source.mistake(("experiment",), f"expected one of {', '.join(KINDS)}, {got}")])
     kind = find_kind(name)
     settings = validated(source, kind.settings)

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from holotorch.core.grid import Grid
-from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.errors import ConfigError, short
 from holotorch.experiments.config.messages import validated
 from holotorch.experiments.config.settings import Count, GridSettings, Number, Settings, Wavelength
 from holotorch.experiments.config.source import Key, read_source
@@ -162,7 +162,7 @@ def _read_points(path: Path) -> tuple[tuple[float, float], ...]:
         try:
             level, phase = map(float, cells)
         except ValueError:
-            raise ValueError(f"{path}:{number}: expected a level and a phase in rad, got {line!r}") from None
+            raise ValueError(f"{path}:{number}: expected a level and a phase in rad, got {short(line)}") from None
         points.append((level, phase))
     if len(points) < 2 or not _rises(points):
         raise ValueError(f"{path}: expected at least two rows with levels that rise from row to row")

@@ -155,6 +155,11 @@ def test_keys_written_twice_a_thousand_times_are_listed_up_to_fifty(tmp_path):
     assert len(lines) == 51 and lines[-1] == "and 950 more mistakes"
 
 
+def test_a_long_name_of_a_kind_is_cut_off(written):
+    (mistake,) = mistakes(written(f"experiment: [{'pec' * 10_000}]\n"))
+    assert "experiment: expected one of pec, " in mistake and len(mistake) < 1000
+
+
 def test_a_number_that_no_float_can_be_is_a_mistake(written):
     (found,) = mistakes(written(CORRECTION), f"solver.patience=1{'0' * 400}")
     assert "solver.patience: expected a number of at most 300 digits, got 1000" in found and "(401 characters)" in found
