@@ -49,7 +49,7 @@ class PECProblem(nn.Module):
             parameters; the solvers keep it.
 
     Raises:
-        TypeError: ``target`` is not a real tensor.
+        TypeError: ``target`` is not a real tensor, or ``propagator`` is a ``ThermalCrosstalk``.
         ValueError: A target that is not [..., C, *image], not finite, negative somewhere or black in a channel; a mask
             that is negative somewhere or 0 in all of a channel; a negative weight; in a call: a phase or a target of
             another shape, or no target at all. The values of a target given in a call are not checked.
@@ -83,6 +83,9 @@ class PECProblem(nn.Module):
         laser: Tensor | None = None,
     ):
         super().__init__()
+        if hasattr(propagator, "lost_heat"):  # what ThermalCrosstalk has
+            got = type(propagator).__name__
+            raise TypeError(f"propagator must map fields to images, got {got}, which is the first argument")
         self.image_axes: int = getattr(propagator, "image_axes", 2)
         if target is not None:
             self._check_axes(target)

@@ -4,6 +4,7 @@ import inspect
 import itertools
 import math
 import warnings
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -95,6 +96,9 @@ class ThermalCrosstalk(PreciseModule):
         ``state_dict`` as ``patch``. Raises ValueError for even sizes, NaN, negative rises, a centre that is not the
         warmest, or a patch with a gradient that is no Parameter.
         """
+        if isinstance(patch, str | Path):
+            table = "torch.from_numpy(numpy.loadtxt(file, delimiter=','))"
+            raise TypeError(f"patch must be a tensor, got the name of a file; of a table in CSV give {table}")
         checks.real("patch", patch)
         checks.all_finite("patch", patch.detach())
         if patch.ndim != 2 or patch.shape[0] % 2 == 0 or patch.shape[1] % 2 == 0:
@@ -204,7 +208,7 @@ class ThermalCrosstalk(PreciseModule):
         if self.size_is_given and (size[0] > phase.shape[-2] or size[1] > phase.shape[-1]):
             raise ValueError(
                 f"crosstalk kernel of {size[0]} x {size[1]} px is larger than the array of {phase.shape[-2]} x "
-                f"{phase.shape[-1]} px; give a smaller size or a larger grid"
+                f"{phase.shape[-1]} px, the last two axes of {tuple(phase.shape)}; give a smaller size or a larger grid"
             )
         phase = at_least_single(phase)
         if sum(factor.numel() for factor in factors) > _TAPS_OF_FFT:

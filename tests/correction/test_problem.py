@@ -165,6 +165,11 @@ def test_a_target_that_no_array_is_as_bright_as_is_warned_of(mean):
         PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 2), target / target.mean((-2, -1), keepdim=True))
 
 
+def test_heat_in_the_place_of_the_propagator_is_refused():
+    with pytest.raises(TypeError, match="got ThermalCrosstalk, which is the first argument"):
+        PECProblem(Fraunhofer(GRID, WAVE), ThermalCrosstalk(0.66))
+
+
 @pytest.mark.parametrize("shape", [(3, 12, 1), (1, 12, 17), (3, 1, 17)])
 def test_a_target_of_another_shape_is_not_broadcast(shape):
     problem = PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 3), torch.ones(shape))

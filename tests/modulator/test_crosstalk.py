@@ -170,3 +170,8 @@ def test_forward_mode_in_sigma_and_phase_is_the_central_difference():
     ends = [spread(sigma + sign * step, phase + sign * step * torch.sin(phase)) for sign in (1, -1)]
     # The values are below 5, and the third derivatives below 100.
     torch.testing.assert_close(got, (ends[0] - ends[1]) / (2 * step), rtol=0, atol=5 * 2e-16 / step + 100 * step**2 / 6)
+
+
+def test_the_name_of_a_file_in_place_of_a_patch_says_how_to_read_it():
+    with pytest.raises(TypeError, match=r"got the name of a file; of a table in CSV give torch.from_numpy"):
+        ThermalCrosstalk.from_patch("kernel.csv")  # type: ignore[arg-type]

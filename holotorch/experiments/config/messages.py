@@ -70,7 +70,7 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     expected = expected or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
     near = difflib.get_close_matches(str(given)[:100].lower(), re.findall(r"'([^']+)'", expected), 1)
     # A text has a unit already, so only numbers get the hint that a unit is missing.
-    hint = entry["ctx"]["hint"] if kind == "quantity" and not isinstance(given, str) else ""
+    hint = entry["ctx"].get("hint_of_text" if isinstance(given, str) else "hint", "") if kind == "quantity" else ""
     if kind.startswith("model_"):
         hint = _inner(model, entry["loc"], ".".join(map(str, key)), given)
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
@@ -100,6 +100,9 @@ def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str,
     known = [key for section in _options_at(model, location[:-1]) for key in section.model_fields]
     if len(location) == 1 and (inside := [f"{key}.{name}" for key in known if _has(model, key, name)]):
         return f"unknown setting; did you mean {' or '.join(inside)}?"
+    key, colon, value = name.partition(":")
+    if colon and key in known:
+        return f"unknown setting; YAML wants a space after the colon, '{key}: {value}'"
     return "unknown setting" + nearest(name, known)
 
 

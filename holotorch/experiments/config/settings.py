@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import itertools
 import math
 import re
 from collections.abc import Callable
@@ -97,7 +98,8 @@ def plausible(kind: Quantity) -> AfterValidator:
     def check(value: float) -> float:
         if kind.problem(value):
             name = "a length" if kind.unit == "m" else f"a number of {kind.words}"
-            words = {"words": f"{name} {kind.range}", "hint": _missing_unit(kind, value) if kind.unit == "m" else ""}
+            hints = (_missing_unit(kind, value), _other_unit(kind, value)) if kind.unit == "m" else ("", "")
+            words = {"words": f"{name} {kind.range}", "hint": hints[0], "hint_of_text": hints[1]}
             raise PydanticCustomError("quantity", "expected {words}", words)
         return value
 
@@ -110,6 +112,15 @@ def _missing_unit(kind: Quantity, value: float) -> str:
         if math.isfinite(value) and kind.usual[0] <= abs(metres(f"{value!r} {unit}")) <= kind.usual[1]:
             return f"; {value:g} means metres: did you mean '{value:g} {unit}'?"
     return kind.cure(value)
+
+
+def _other_unit(kind: Quantity, value: float) -> str:
+    """A hint for a length with a unit outside the range: another unit with which the same number is a usual length."""
+    for power, unit in itertools.product((-2, -3, -6, -9), ("um", "mm", "cm", "nm")):
+        number = value / 10.0**power  # as it was written, if its unit has this power
+        if 1 <= number < 1000 and kind.usual[0] <= metres(f"{number:.6g} {unit}") <= kind.usual[1]:
+            return f"; did you mean '{number:.6g} {unit}'?"
+    return ""
 
 
 _TIMES = re.compile(r"(\d[^x×]{0,20}?)\s*[x×]\s*(\d[^x×]{0,20})")

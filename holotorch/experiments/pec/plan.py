@@ -245,9 +245,10 @@ def _notes(experiment: PECExperiment) -> list[str]:
                 )
         spot = longest * farthest / min(grid.extent)
         if spot > 1.5 * max(grid.pitch):
+            nearer = farthest * max(grid.pitch) / spot
             notes.append(
                 f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "
-                "detail of the picture cannot be formed"
+                f"detail of the picture cannot be formed; a sample is resolved up to {nearer * 1e3:.3g} mm"
             )
     elif len(experiment.wavelengths) > 1:
         notes.append(

@@ -2,6 +2,7 @@
 
 import asyncio
 import csv
+import errno
 import itertools
 import math
 import socket
@@ -239,7 +240,8 @@ def receivers_of(
 
 def _config_error(error: OSError) -> Exception:
     """Convert an error about an address or port to ConfigError; an error about a file stays unchanged."""
-    return ConfigError([error.strerror or str(error)]) if error.filename is None else error
+    cure = "; end the other program, or choose another --port or --page HOST:PORT" * (error.errno == errno.EADDRINUSE)
+    return ConfigError([f"{error.strerror or error}{cure}"]) if error.filename is None else error
 
 
 async def _send(

@@ -54,7 +54,7 @@ def calibrate_catheter(
         ColourTable(camera, catheter)
     except ValueError as error:
         listed = ", ".join(f"{place}: {list(level)}" for place, level in zip(places, levels, strict=True))
-        advice = "photograph the bands in even light without gloss, or paint others"
+        advice = "do X (to the right) and Y (downwards) lie on the bands? Photograph them in even light without gloss"
         raise ConfigError([f"{photograph}: {error}; found {listed}: {advice}"]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
     save_catheter(out, catheter)

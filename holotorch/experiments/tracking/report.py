@@ -139,7 +139,7 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     return summary | {"notes": notes, "pictures": log.pictures, "peak_memory_bytes": peak_memory()}
 
 
-_LONGER = "longer bands, a nearer camera or more pixels help, and colours at full resolution (--record)"
+_LONGER = "longer bands, a nearer camera or more pixels help, and colours at full resolution (a camera's --record)"
 _COLOURS = "are the colours of the catheter's file those of this video? holotorch calibrate catheter reads them"
 _ADVICE = {
     Status.BAD_FRAME: "is the video of the camera's size, and neither black nor white?",

@@ -59,7 +59,8 @@ def open_inputs(
         elif replayed and beside.is_file():
             paths[f"{name}.yaml"] = beside
         else:
-            missing.append(f"no {name}.yaml: say which with --{name}, or {name}: in a configuration")
+            here = f", such as --{name} {name}.yaml" if Path(f"{name}.yaml").is_file() else ""
+            missing.append(f"no {name}.yaml: say which with --{name}{here}, or {name}: in a configuration")
     if missing:
         raise ConfigError(missing)
     lens, tool = _loaded(paths)

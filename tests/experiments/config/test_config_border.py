@@ -155,6 +155,17 @@ def test_keys_written_twice_a_thousand_times_are_listed_up_to_fifty(tmp_path):
     assert len(lines) == 51 and lines[-1] == "and 950 more mistakes"
 
 
+@pytest.mark.parametrize(
+    ("word", "advice"),
+    [
+        ("grid.pitch=8mm", "got '8mm'; did you mean '8 um'?"),
+        ("grid={shape:32, pitch: 8 um}", "unknown setting; YAML wants a space after the colon, 'shape: 32'"),
+    ],
+)
+def test_advice_on_units_and_colons(written, word, advice):
+    assert any(advice in mistake for mistake in mistakes(written(CORRECTION), word))
+
+
 def test_a_long_name_of_a_kind_is_cut_off(written):
     (mistake,) = mistakes(written(f"experiment: [{'pec' * 10_000}]\n"))
     assert "experiment: expected one of pec, " in mistake and len(mistake) < 1000
