@@ -164,10 +164,24 @@ def _nested(rng: Random, holder: Any, key: Any, other: Any) -> None:
         holder[key] = [holder[key]] if rng.random() < 0.5 else {"a": holder[key]}
 
 
+_MOST = 50_000  # values of a tree that is written as YAML, which takes seconds
+
 _CHANGES: tuple[Callable[[Random, Any, Any, Any], None], ...] = (
     *(_replaced, _replaced, _replaced, _replaced, _scaled, _scaled, _removed, _listed, _opened, _borrowed, _borrowed),
     *(_renamed, _nested),
 )
+
+
+def _count(tree: Any) -> int:
+    """Number of values and of 20 characters of a tree, as often as they are written: what is shared is written once."""
+    waiting, known, count = [tree], set(), 0
+    while waiting and count <= _MOST:
+        value = waiting.pop()
+        count += 1 + (len(value) // 20 if isinstance(value, str) else 0)
+        if isinstance(value, dict | list) and id(value) not in known:
+            known.add(id(value))
+            waiting += [*value, *value.values()] if isinstance(value, dict) else value
+    return count
 
 
 def yaml_mutated(rng: Random, text: bytes, other: bytes) -> bytes:
@@ -182,8 +196,10 @@ def yaml_mutated(rng: Random, text: bytes, other: bytes) -> bytes:
     style = rng.choice((None, True, False))
     try:
         changed = tree_mutated(rng, yaml.safe_load(text), yaml.safe_load(other))
+        if _count(changed) > _MOST:
+            raise RecursionError
         made = yaml.safe_dump(changed, sort_keys=False, default_flow_style=style, allow_unicode=True)
-    except RecursionError:  # of what is nested too deeply to be written by the library
+    except RecursionError:  # of what is nested too deeply, or too much, to be written by the library
         made = text.decode() + "deep: " + "[" * 1000 + "]" * 1000
     return made.encode("utf-8", "surrogatepass")[:FULL]
 
