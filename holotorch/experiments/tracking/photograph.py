@@ -68,7 +68,7 @@ def calibrate_catheter(
         "edit them"
     )
     notes = [
-        f"band {i} varies much within {place}: choose a smaller box that holds this band alone"
+        f"band {i} varies much within {place}: choose a box that holds this band alone (a thin tube has none)"
         for i, (place, deviation) in enumerate(zip(places, spread, strict=True), 1)
         if deviation > _UNEVEN
     ]
