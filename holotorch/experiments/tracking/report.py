@@ -150,7 +150,7 @@ _ADVICE = {
     Status.EDGES_UNCLEAR: _LONGER,
     Status.OUT_OF_FRAME: "the bands must lie within the picture",
     Status.OUTSIDE_CAMERA: "the camera's file says nothing there: calibrate with boards near the picture's edges",
-    Status.INCONSISTENT: "no pose explains the edges: are `edges` of this catheter, is the camera right, are all bands free?",
+    Status.INCONSISTENT: "no pose explains the edges: are `edges` and camera right, and all bands free?",
     Status.UNCERTAIN: _LONGER,
 }
 
