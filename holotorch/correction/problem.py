@@ -55,7 +55,8 @@ class PECProblem(nn.Module):
             another shape, or no target at all. The values of a target given in a call are not checked.
 
     Warns:
-        SamplingWarning: ``target`` is brighter than the light of the array, or half as bright, and nothing scales it.
+        SamplingWarning: ``target`` is brighter than the light of the array, or less than half as bright, and nothing
+            scales it.
 
     Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; the transfer function is misplaced in print).
     """

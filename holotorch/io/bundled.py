@@ -1,4 +1,4 @@
-"""Names of bundled pictures and paths of configurations; without torch, which takes seconds to import."""
+"""Names of bundled pictures, configurations and similar paths; without torch, which takes seconds to import."""
 
 import contextlib
 import difflib
@@ -14,13 +14,19 @@ def no_such_picture(source: str) -> str:
     That is one of a bundled picture, or else of a file in the same folder.
     """
     near = difflib.get_close_matches(source, BUNDLED_IMAGES, 1)
-    with contextlib.suppress(OSError, ValueError):  # no such folder, or a name that no file can have
-        path = Path(source)
-        files = [] if near else [each.name for each in path.parent.iterdir() if each.is_file()]
-        near += [str(path.with_name(name)) for name in difflib.get_close_matches(path.name, files, 1, cutoff=0.8)]
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    suggested = near[0] if near else similar_path(source)
+    hint = f"did you mean {str(suggested)!r}? " if suggested else ""
     shown = repr(source) if len(source) < 200 else f"{source[:200]!r}... ({len(source)} characters)"
     return f"no such picture: {shown}; {hint}give a path, or one of {', '.join(BUNDLED_IMAGES)}"
+
+
+def similar_path(path: str | Path) -> Path | None:
+    """The neighbour of ``path``, which does not exist, with the most similar name; None if none is similar."""
+    path = Path(path)
+    with contextlib.suppress(OSError, ValueError):  # no such folder, or a name that no file can have
+        names = [each.name for each in path.parent.iterdir()]
+        return next((path.with_name(near) for near in difflib.get_close_matches(path.name, names, 1, cutoff=0.8)), None)
+    return None
 
 
 def find_config(name: str | Path) -> Path | None:

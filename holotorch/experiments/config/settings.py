@@ -1,7 +1,5 @@
 """Building blocks of configurations: units, ranges, and sections that several kinds share."""
 
-import contextlib
-import difflib
 import itertools
 import math
 import re
@@ -15,6 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from holotorch.core.quantities import PITCH, PLANE, WAVELENGTH, Quantity
 from holotorch.experiments.config.errors import short
+from holotorch.io.bundled import similar_path
 
 _POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # powers of ten, in metres
 # No two neighbouring parts of the pattern match the same characters, so a text without a match takes linear time.
@@ -157,10 +156,8 @@ def existing(there: Callable[[str], object], missing: Callable[[str], str]) -> B
 
 
 def _no_path(value: str) -> str:
-    path, near = Path(value), []
-    with contextlib.suppress(OSError, ValueError):
-        near = difflib.get_close_matches(path.name, [each.name for each in path.parent.iterdir()], 1, cutoff=0.8)
-    hint = f"; did you mean {path.with_name(near[0])}?" if near else ""
+    near = similar_path(value)
+    hint = f"; did you mean {near}?" if near else ""
     return f"expected a file or folder that exists, got {short(value)}{hint}"
 
 
