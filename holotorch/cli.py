@@ -25,6 +25,8 @@ OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 def main(arguments: list[str] | None = None) -> int:
     """Run one subcommand and return its exit status: 0 success, 1 failure, 2 bad input, 130 interruption."""
     options = _parsed(arguments)
+    if not sys.stderr.isatty():  # each state of a bar is a line in a log
+        os.environ.setdefault("TQDM_MININTERVAL", "10")
     from holotorch.experiments.config.errors import ConfigError
 
     try:

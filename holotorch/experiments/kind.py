@@ -30,7 +30,7 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     settings: type[SettingsT]  # pydantic model of the configuration
     parallel: ClassVar[bool] = False  # whether several processes, started by ``torchrun``, share one run
     announces: ClassVar[bool] = True  # whether the plan is printed before the run begins
-    data: ClassVar[str] = ""  # key of the user's own picture or volume, such as "target.image"; empty if there is none
+    data: ClassVar[str] = ""  # key of the user's own data, such as "target.image"; empty if there is none
     example: ClassVar[str]  # path of the bundled configuration that ``holotorch new`` copies
 
     def contradictions(self, settings: SettingsT) -> list[tuple[Key, str]]:

@@ -123,14 +123,15 @@ def test_every_kind_has_settings_of_its_own_name(name):
         ("eye/teapot.yaml", "volume={path: slices/}", "slices-eye"),
         ("joint/teapot.yaml", "volume.path=.", "work-joint"),
         ("joint/teapot.yaml", "steps=3", "teapot"),
-        ("tracking/track.yaml", "source=my photo.png", "track"),
+        ("tracking/track.yaml", "source=my film.mp4", "my film-track"),
+        ("tracking/track.yaml", "source=0", "track"),  # a camera
         ("perception/layout.yaml", "seed=3", "layout"),
     ],
 )
 def test_a_run_is_named_after_the_data_of_the_user_or_its_configuration(config, word, name, tmp_path, monkeypatch):
     (tmp_path / "work" / "slices").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "work")
-    for file in ("my photo.png", "head.v2.nii.gz", "ct.h5"):
+    for file in ("my photo.png", "my film.mp4", "head.v2.nii.gz", "ct.h5"):
         (tmp_path / "work" / file).touch()
     folder = config.split("/")[0].replace("tracking", "track").replace("perception", "perception_layout")
     assert run_name(f"configs/{config}", ["seed=1", word], folder) == name

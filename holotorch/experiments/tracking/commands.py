@@ -1,6 +1,7 @@
 """Arguments and actions of ``track`` and ``calibrate``. Other modules are imported only when a command runs."""
 
 import argparse
+import json
 import re
 from pathlib import Path
 
@@ -18,7 +19,8 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     what = "video, folder of pictures or of a recording, number of a camera, or: synthetic"
     track.add_argument("source", metavar="SOURCE", help=what)
     track.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, such as frames=10")
-    track.add_argument("--out", type=Path, help="folder of the run (default: runs/track-001, ...)")
+    about = "folder of the run (default: runs/track-001, ..., or runs/VIDEO-track-001, ...)"
+    track.add_argument("--out", type=Path, help=about)
     track.add_argument("--method", default="ours", help="ours (default) or thesis")
     track.add_argument("--record", action="store_true", help="keep every frame, losslessly, to be tracked again")
     track.add_argument("--no-video", action="store_true", help="write no videos")
@@ -56,6 +58,7 @@ def _track(options: argparse.Namespace) -> int:
     from holotorch.experiments.config.messages import validated
     from holotorch.experiments.config.source import Key, Source, override
     from holotorch.experiments.execute import execute, print_outcome
+    from holotorch.experiments.registry import run_name
     from holotorch.experiments.tracking.config import TrackSettings
 
     given = {"source": options.source, "method": options.method, "record": options.record, "still": options.still}
@@ -69,7 +72,8 @@ def _track(options: argparse.Namespace) -> int:
     if mistakes:
         raise ConfigError(mistakes)
     settings = validated(source, TrackSettings)
-    folder, complete = execute(settings, options.out, "track")
+    name = run_name("track", [f"source={json.dumps(options.source)}"], "track")
+    folder, complete = execute(settings, options.out, name)
     print_outcome(folder)
     return OK if complete else INTERRUPTED
 

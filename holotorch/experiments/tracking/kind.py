@@ -21,6 +21,7 @@ class TrackKind(ExperimentKind[TrackSettings, "TrackingExperiment"]):
 
     settings = TrackSettings
     example = "configs/tracking/track.yaml"
+    data = "source"
 
     def build(self, settings: TrackSettings) -> TrackingExperiment:
         from holotorch.experiments.tracking.run import build_tracking

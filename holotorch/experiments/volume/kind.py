@@ -19,7 +19,7 @@ class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
     """The hologram of a volume; see :mod:`holotorch.experiments.kind`."""
 
     settings = VolumeSettings
-    example = "configs/volume/tooth.yaml"
+    example = "configs/volume/hand.yaml"
     parallel = True
     data = "volume.path"
 
