@@ -7,24 +7,23 @@ import torch
 from torch import Tensor
 
 FRESNEL_BORDER = 1.3  # the power series is exact to rounding up to this argument, and the quadrature above it
-_TERMS = 34  # number of terms of the series
-_SERIES = [
-    [sign / (math.factorial(n) * (2 * n + 1)) if n % 2 == part else 0.0 for part in (0, 1)]
-    for n, sign in zip(range(_TERMS), [1, 1, -1, -1] * 9, strict=False)
-]
+_TERMS = 16  # number of terms of each of the two series, a power of 2; from the 14th on they are below 1e-17
+_SERIES = [[(-1) ** k / (math.factorial(n) * (2 * n + 1)) for n in (2 * k, 2 * k + 1)] for k in range(_TERMS)]
 _STEP, _NODES = 0.13, 42  # step and number of nodes of the quadrature
 
 
 def fresnel_integral(u: Tensor) -> Tensor:
     """int_0^u exp(-i pi t^2 / 2) dt = C(u) - i S(u) for abs(u) <= 1.3 by a power series, complex128."""
     factor = math.pi / 2 * u.square()
-    # Terms (-i factor)^n / (n! (2 n + 1)): even n contribute to C, odd n to S.
-    # The second derivative of a cumulative product is NaN at 0, and that of the zeroth and first power as well.
-    exponents, coefficients = _series(u.device)
-    base = factor[..., None]
-    powers = torch.cat([torch.ones_like(base), base, base**exponents], -1)
-    sums = powers @ coefficients
-    return torch.complex(u * sums[..., 0], -u * sums[..., 1])
+    # Terms (-i factor)^n / (n! (2 n + 1)): even n contribute to C, odd n to S. The powers of factor^2 are products, and
+    # each turn doubles their number; derivatives of ``pow`` and ``cumprod`` are NaN at 0.
+    power = factor.square()[..., None]
+    powers = torch.cat([torch.ones_like(power), power], -1)
+    while powers.shape[-1] < _TERMS:
+        power = power.square()
+        powers = torch.cat([powers, power * powers], -1)
+    sums = powers @ _series(u.device)
+    return torch.complex(u * sums[..., 0], -u * factor * sums[..., 1])
 
 
 def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,11 +41,10 @@ def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @lru_cache(maxsize=8)  # making the constants takes longer than using them
-def _series(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Exponents from 2 on, [TERMS - 2], and coefficients of all terms [TERMS, 2] of C and S."""
+def _series(device: torch.device) -> Tensor:
+    """Coefficients [TERMS, 2] of C and S."""
     with torch.inference_mode(False):
-        exponents = torch.arange(2, _TERMS, dtype=torch.float64, device=device)
-        return exponents, torch.tensor(_SERIES, dtype=torch.float64, device=device)
+        return torch.tensor(_SERIES, dtype=torch.float64, device=device)
 
 
 @lru_cache(maxsize=8)

@@ -1,12 +1,14 @@
 """Quadrature rules with few nodes for integrals over wavelength: Gauss's rule, and rules of least error for speckle."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 _MOST = 512  # largest number of nodes
 _JITTER = 1e-10  # added to the diagonal so that the equations for the weights are solvable; adds <= 1e-5 to the error
+_FLOOR = 1e-12  # added to the squared error before its logarithm
 _EXACT = 1e-5  # error at which the search for better nodes stops
 _STARTS = (0.85, 0.95)  # outermost nodes of evenly spaced initial nodes, as fractions of the half band
 
@@ -80,8 +82,9 @@ class SpeckleIntegral:
         The expectation is over fully developed speckle with the correlation of :func:`correlation` and a mean
         brightness proportional to the transmission of the iris.
         """
-        energy = self.weights @ self._second_moment(self.nodes, self.nodes) @ self.weights
-        return (self._squared_error(energy, positions, shares).clamp_min(0) / energy).sqrt()
+        cross = shares @ self._second_moment(positions, self.nodes) @ self.weights
+        square = self._energy - 2 * cross + shares @ self._second_moment(positions, positions) @ shares
+        return (square.clamp_min(0) / self._energy).sqrt()
 
     def rule(self, count: int, *, enough: float = _EXACT) -> tuple[Tensor, Tensor]:
         """``count`` nodes and weights with the smallest :meth:`error` found; the weights are positive and sum to 1.
@@ -133,39 +136,66 @@ class SpeckleIntegral:
                 low = middle
         return rule
 
+    @cached_property
+    def _energy(self) -> Tensor:
+        """Expected square of the integral."""
+        return self.weights @ self._second_moment(self.nodes, self.nodes) @ self.weights
+
     def _descend(self, start: Tensor) -> tuple[Tensor, Tensor]:
         """Rule at a local minimum of the error, by L-BFGS from nodes ``start``; the band is scaled to -1..1."""
-        hidden = torch.atanh(start).clone().requires_grad_()
-        energy = self.weights @ self._second_moment(self.nodes, self.nodes) @ self.weights
+        hidden = torch.atanh(start).clone()
         search = torch.optim.LBFGS([hidden], max_iter=60, line_search_fn="strong_wolfe", tolerance_change=1e-12)
 
         def closure() -> Tensor:
-            search.zero_grad()
             positions = torch.tanh(hidden)  # within the band
-            # The logarithm is minimized because errors span decades; the addend is far below any tolerance.
-            square = self._squared_error(energy, positions, self._best_weights(positions))
-            loss = (square.clamp_min(0) + 1e-12).log()
-            loss.backward()
-            return loss
+            square, gradient = self._least_square(positions)
+            hidden.grad = gradient * (1 - positions.square())
+            return square
 
-        with torch.enable_grad():
-            search.step(closure)
-        positions = torch.tanh(hidden.detach()).sort().values
-        return positions, self._best_weights(positions)
+        search.step(closure)
+        positions = torch.tanh(hidden).sort().values
+        given, among = self._second_moment(positions, self.nodes), self._second_moment(positions, positions)
+        return positions, self._best_weights(given, among)
+
+    def _least_square(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Logarithm of the squared error with the best weights for ``positions``, and its gradient [N].
+
+        The logarithm, since errors span decades; its addend is far below any tolerance. Where the weights are best, the
+        gradient is that with fixed weights.
+        """
+        given, slope = self._moment_and_slope(positions, self.nodes)
+        among, slope_among = self._moment_and_slope(positions, positions)
+        shares = self._best_weights(given, among)
+        square = (self._energy - 2 * shares @ given @ self.weights + shares @ among @ shares).clamp_min(0) + _FLOOR
+        return square.log(), 2 * shares * (slope_among @ shares - slope @ self.weights) / square
 
     def _second_moment(self, first: Tensor, second: Tensor) -> Tensor:
         means = torch.outer(1 - 2 * self.iris * first, 1 - 2 * self.iris * second)
         return means + correlation(first, second, self.beat, self.iris)
 
-    def _squared_error(self, energy: Tensor, positions: Tensor, shares: Tensor) -> Tensor:
-        cross = shares @ self._second_moment(positions, self.nodes) @ self.weights
-        return energy - 2 * cross + shares @ self._second_moment(positions, positions) @ shares
+    def _moment_and_slope(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`_second_moment`, and its derivative [M, N] with respect to ``first``; at a kink, the mean of both."""
+        shown = 1 - 2 * self.iris * second
+        apart, shared = first[:, None] - second, 1 - 2 * self.iris * torch.maximum(first[:, None], second)
+        scale = torch.pi * self.beat * shared
+        phase = scale * apart
+        cosine, sine, close = phase.cos(), phase.sin(), phase.abs() < 0.01
+        # sinc, and (cos x - sinc x) / x by its series where the difference would lose digits
+        sinc = torch.where(close, 1 - phase.square() / 6 * (1 - phase.square() / 20), sine / phase)
+        bend = torch.where(close, phase * (phase.square() / 30 - 1 / 3), (cosine - sinc) / phase)
+        square_root = shared * sinc
+        slope = bend * scale * shared - self.iris * cosine * (1 + apart.sign())
+        moment = torch.outer(1 - 2 * self.iris * first, shown) + square_root.square()
+        return moment, 2 * square_root * slope - 2 * self.iris * shown
 
-    def _best_weights(self, positions: Tensor) -> Tensor:
-        """Weights of least error for given nodes. Their sum is 1, which is exact for an intensity without speckle."""
-        count = len(positions)
-        identity, ones = torch.eye(count, dtype=positions.dtype), positions.new_ones(count, 1)
-        top = torch.cat([self._second_moment(positions, positions) + _JITTER * identity, ones], 1)
-        bottom = torch.cat([ones.T, positions.new_zeros(1, 1)], 1)
-        moments = torch.cat([self._second_moment(positions, self.nodes) @ self.weights, positions.new_ones(1)])
+    def _best_weights(self, given: Tensor, among: Tensor) -> Tensor:
+        """Weights of least error, from the second moments of their nodes with the many and among themselves.
+
+        Their sum is 1, which is exact for an intensity without speckle.
+        """
+        count = len(among)
+        identity, ones = torch.eye(count, dtype=among.dtype), among.new_ones(count, 1)
+        top = torch.cat([among + _JITTER * identity, ones], 1)
+        bottom = torch.cat([ones.T, among.new_zeros(1, 1)], 1)
+        moments = torch.cat([given @ self.weights, among.new_ones(1)])
         return torch.linalg.solve(torch.cat([top, bottom]), moments)[:count]

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from holotorch.optics.light.quadrature import SpeckleIntegral, gauss_rule
 
 CUTOFF = 0.1  # fraction of the peak below which the thesis drops the power (Sec. 5.5.2.2)
 _NODES = 256  # number of quadrature nodes over the band; exact to rounding for phases that vary by up to 200 rad
+_legendre_rule = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)  # takes longer than what uses it
 
 
 @dataclass(frozen=True)
@@ -267,7 +269,7 @@ class Spectrum:
         low, high = self.band()
         ends = np.array([low, *(joint for joint in self.profile.joints if low < joint < high), high])
         count = max(2, math.ceil(_NODES / (len(ends) - 1)))
-        t, weight = np.polynomial.legendre.leggauss(count)
+        t, weight = _legendre_rule(count)
         half = np.diff(ends)[:, None] / 2
         nodes = ends[:-1, None] + half * (1 + t)
         return torch.from_numpy(nodes.ravel()), torch.from_numpy((half * weight).ravel())

@@ -103,6 +103,22 @@ def test_the_least_error_takes_fewer_wavelengths_than_gauss():
     )
 
 
+@pytest.mark.parametrize("iris", [0.0, 0.05])
+def test_the_gradient_of_the_search_is_that_of_the_error(iris):
+    nodes = torch.linspace(-1, 1, 64, dtype=torch.float64)
+    integral = SpeckleIntegral(nodes, torch.softmax(-nodes.square(), 0), 6.0, iris)
+    positions = torch.tensor([-0.8, -0.3, nodes[30], 0.2, 0.2004, 0.7], dtype=torch.float64)  # equal and near ones too
+    value, gradient = integral._least_square(positions)
+    _, shares = integral._descend(positions)  # any weights with a sum of 1 are worse than the best
+    assert value < 2 * integral.error(positions, shares).log() + integral._energy.log() + 1e-9
+    ahead, behind = (
+        torch.stack([integral._least_square(positions + step * e)[0] for e in torch.eye(6, dtype=torch.float64)])
+        for step in (1e-6, -1e-6)
+    )
+    close = torch.tensor([True, True, iris == 0, True, True, True])  # at a kink it is the mean of both sides
+    assert ((ahead - behind) / 2e-6 - gradient)[close].abs().max() < 1e-5 * gradient.abs().max()
+
+
 @pytest.mark.parametrize("spectrum", [Spectrum.led(520e-9), Spectrum.gaussian(520e-9, 8e-9)], ids=["led", "gaussian"])
 @pytest.mark.parametrize("count", [1, 2, 5, 12])
 def test_gauss_is_exact_for_polynomials(spectrum, count):
