@@ -11,7 +11,7 @@ from oracles import holograms
 from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
 from holotorch.hologram import AxialHologram, DirectHologram
-from holotorch.hologram.nodes import Nodes, choose_nodes
+from holotorch.hologram.nodes import Nodes, _spreading_error, choose_nodes
 
 WAVE = 520e-9
 PITCH = 3.74e-6
@@ -200,3 +200,11 @@ def test_a_pitch_below_the_wavelength_is_refused():
     for cone in ("taper", "full"):
         with pytest.raises(ValueError, match="needs a pitch of at least 0.9 wavelengths, .* ConvolutionHologram"):
             AxialHologram(Grid(32, 0.4e-6), WAVE, [5e-6, 6e-6], cone=cone)
+
+
+@pytest.mark.parametrize("oversampling", [1.25, 1.5, 2.0])
+@pytest.mark.parametrize("width", [4, 6, 8])
+def test_the_error_of_spreading_depends_on_the_window_alone(width, oversampling):
+    low, high = 1.2e6, 1.9e6
+    nodes = Nodes(0.02, 1 / (oversampling * (high - low)), 30, width, oversampling, (low + high) / 2)
+    assert _spreading_error(width, oversampling) == pytest.approx(nodes.error(low, high), rel=1e-3)
