@@ -226,6 +226,8 @@ class ThermalCrosstalk(PreciseModule):
 def _shifted_sum(image: Tensor, taps: Tensor) -> Tensor:
     """Convolution of ``image`` [..., H, W] with ``taps`` [h, w] as a sum of shifted copies, one per tap."""
     rows, columns = taps.shape
+    if min(rows, columns) == 1 and checks.readable(image):
+        return _summed_along(image, taps.flatten().tolist(), -2 if columns == 1 else -1)
     height, width = image.shape[-2:]
     padded = _padded(image, taps.shape)
     # Numbers are faster than tensors.
@@ -237,6 +239,18 @@ def _shifted_sum(image: Tensor, taps: Tensor) -> Tensor:
             result = result.addcmul(padded[..., y : y + height, x : x + width], tap)
         elif tap:
             result.add_(padded[..., y : y + height, x : x + width], alpha=tap)
+    return result
+
+
+def _summed_along(image: Tensor, taps: list[float], axis: int) -> Tensor:
+    """:func:`_shifted_sum` along one axis: parts of arrays are added, which needs no padding."""
+    size, middle = image.shape[axis], len(taps) // 2
+    result = image * taps[middle]
+    for k, tap in enumerate(taps):
+        moved = abs(k - middle)
+        if tap and 0 < moved < size:
+            to, source = (moved, 0) if k > middle else (0, moved)
+            result.narrow(axis, to, size - moved).add_(image.narrow(axis, source, size - moved), alpha=tap)
     return result
 
 
