@@ -3,7 +3,9 @@
 A page asks for the clock of this computer and gets the newest pose only; one that does not keep up misses poses, and
 one that takes none for five seconds is cut off. Poses are JSON: kind, sequence, captured, sent, status, answered,
 reason, lag, and for an answer tip [3] in metres, direction [3] and covariance [9] of the tip in m^2. Pictures are
-binary: a byte for the ``Channel``, the time of capture as a little-endian double, and a JPEG; again the newest only.
+binary: a byte for the ``Channel``, the time of capture as a little-endian double, the length of the next part as a
+little-endian uint16, the pose that was found in the picture (captured, status and so on, as above) or nothing, and a
+JPEG; again the newest only. The pose is sent with its picture, which arrives later than the newest pose.
 
 On the loopback interface only programs of this computer can connect; requests for other host names, and WebSockets that
 another web site opens, are refused. On any other interface a random token in the address of the page is demanded, and
@@ -19,6 +21,7 @@ import ssl
 import struct
 from collections import deque
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -40,7 +43,7 @@ from holotorch.tracking.streaming.packet import FRAME, now
 
 PORT = 8765
 _FOLDER = Path(__file__).with_name("browser")
-_LONGEST = 4096  # bytes of a message from a page
+_LONGEST = 4096  # bytes of a message from a page, and characters of a reason sent to it
 _REPLIES = 16  # answers that wait for a page
 _PATIENCE = 5.0  # seconds that a page may take to accept a message
 _HEADERS = headers(
@@ -145,11 +148,7 @@ class PageServer:
             for client in self._clients:
                 client.reply(self._setup())
         number = next(self._sequence)
-        message: dict[str, Any] = {"kind": "pose", "sequence": number, "captured": captured, "sent": now(), "lag": lag}
-        message |= {"status": pose.status.name, "answered": pose.answered, "reason": pose.reason}
-        if pose.answered:
-            covariance = pose.covariance[:3, :3].flatten().tolist()
-            message |= {"tip": pose.tip.tolist(), "direction": pose.direction.tolist(), "covariance": covariance}
+        message = {"kind": "pose", "sequence": number, "sent": now(), "lag": lag} | _words(pose, captured)
         self._newest = json.dumps(message, allow_nan=False)
         for client in self._clients:
             client.offer(self._newest)
@@ -157,22 +156,24 @@ class PageServer:
 
     def see(self, pixels: Tensor, pose: Pose, captured: float) -> None:
         """Show a tracked frame, uint8 [3, H, W], and its pose in the camera's frame; from any thread, never waits."""
-        self.picture(Channel.CAMERA, pixels, captured)
+        pose = replace(pose, reason=pose.reason[:_LONGEST])
+        self.picture(Channel.CAMERA, pixels, captured, json.dumps(_words(pose, captured)))
         if self._panel == "overlay" and self._camera is not None and self._clients:
             self.picture(Channel.PANEL, overlay(pixels, pose, self._camera, self._catheter), captured)
 
-    def picture(self, channel: Channel, pixels: Tensor, captured: float) -> None:
-        """Offer a picture, uint8 [3, H, W], to all pages; from any thread, never waits."""
+    def picture(self, channel: Channel, pixels: Tensor, captured: float, pose: str = "") -> None:
+        """Offer a picture, uint8 [3, H, W], and its pose in JSON to all pages; from any thread, never waits."""
         if not self._clients or self._loop is None:
             return
         if channel not in self._encoders:
             prepare = Undistorter(self._camera) if channel is Channel.CAMERA and self._camera is not None else None
             self._encoders[channel] = Encoder(partial(self._deliver, channel), prepare)
-        self._encoders[channel].put(pixels, captured)
+        self._encoders[channel].put(pixels, (captured, pose.encode()))
 
-    def _deliver(self, channel: Channel, jpeg: bytes, captured: float) -> None:
+    def _deliver(self, channel: Channel, jpeg: bytes, of: tuple[float, bytes]) -> None:
         """Hand an encoded picture to the clients, from the thread of an encoder."""
-        message = struct.pack("<Bd", channel, captured) + jpeg
+        captured, pose = of
+        message = struct.pack("<BdH", channel, captured, len(pose)) + pose + jpeg
 
         def offer() -> None:
             for client in self._clients:
@@ -269,6 +270,15 @@ class _Client:
                     if isinstance(self.request.transport, asyncio.WriteTransport):
                         self.request.transport.abort()
                     return
+
+
+def _words(pose: Pose, captured: float) -> dict[str, Any]:
+    """What a page is told of a pose or refusal."""
+    said = {"captured": captured, "status": pose.status.name, "answered": pose.answered, "reason": pose.reason}
+    if pose.answered:
+        covariance = pose.covariance[:3, :3].flatten().tolist()
+        said |= {"tip": pose.tip.tolist(), "direction": pose.direction.tolist(), "covariance": covariance}
+    return said
 
 
 def _tool(catheter: Catheter) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import itertools
 import threading
 from collections.abc import Callable, Iterator
 from enum import IntEnum
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -29,20 +29,20 @@ class Encoder:
     """Encodes the newest picture as JPEG, in a thread of its own; pictures that arrive in the meantime replace it.
 
     Args:
-        deliver: Called in that thread with the JPEG and the time of capture of each encoded picture.
+        deliver: Called in that thread with the JPEG of each encoded picture and what :meth:`put` was given with it.
         prepare: Applied to the picture first.
     """
 
-    def __init__(self, deliver: Callable[[bytes, float], None], prepare: Callable[[Tensor], Tensor] | None = None):
+    def __init__(self, deliver: Callable[[bytes, Any], None], prepare: Callable[[Tensor], Tensor] | None = None):
         self._deliver, self._prepare = deliver, prepare
-        self._newest: tuple[Tensor, float] | None = None
+        self._newest: tuple[Tensor, Any] | None = None
         self._wake, self._over = threading.Event(), False
         self._thread = threading.Thread(target=self._work, daemon=True, name="pictures for the page")
         self._thread.start()
 
-    def put(self, picture: Tensor, captured: float) -> None:
-        """Offer a picture, uint8 [3, H, W]; never waits."""
-        self._newest = picture, captured
+    def put(self, picture: Tensor, known: Any) -> None:
+        """Offer a picture, uint8 [3, H, W], and what is known of it, such as its time of capture; never waits."""
+        self._newest = picture, known
         self._wake.set()
 
     def close(self) -> None:
@@ -59,8 +59,8 @@ class Encoder:
                 return
             item, self._newest = self._newest, None
             if item is not None:
-                picture, captured = item
-                self._deliver(encode_jpeg(self._prepare(picture) if self._prepare else picture), captured)
+                picture, known = item
+                self._deliver(encode_jpeg(self._prepare(picture) if self._prepare else picture), known)
 
 
 class PanelSource:

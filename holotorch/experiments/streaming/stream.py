@@ -138,9 +138,9 @@ def _with_frames(poses: Iterable[TimedPose], recording: Path, page: "PageServer"
         pictures = iter(frames)
         for captured, pose in poses:
             frame = next(pictures, None)  # the recording of an interrupted run may be shorter than its table of poses
-            if frame is not None and frame.pixels is not None:
-                page.see(frame.pixels, pose, captured)
             yield captured, pose
+            if frame is not None and frame.pixels is not None:  # when it is due
+                page.see(frame.pixels, pose, captured)
 
 
 def stream(

@@ -491,7 +491,7 @@ def test_the_tracked_frame_lies_behind_the_catheter_without_its_distortion(tmp_p
         async with browser(tmp_path) as open_tab:
             tab = await open_tab(server.address)
             await tab.until("view.state.offset !== null")
-            server.see(frame, given, now() + 60)
+            server.see(frame, Pose.refused(Status.NO_CATHETER, "none"), now() + 60)
             await tab.until("view.pictures.pictures.camera")
             await tab.value(FRAMES)
             u, v, count = await tab.value(SPOT.replace(YELLOW, "data[4 * i] > 128"))
@@ -499,10 +499,45 @@ def test_the_tracked_frame_lies_behind_the_catheter_without_its_distortion(tmp_p
             scale = 800 / 640
             assert count > 100 and math.dist(((u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5), pinhole) < 0.6
             assert math.dist((x, y), pinhole) > 5
-            await shown(server, tab, given)
+            server.see(frame, given, now() + 61)
+            await tab.until("view.state.pictured.answered")
             assert await tab.value("view.tipOnScreen()") == pytest.approx(pinhole, abs=1e-3)
 
     run(test, camera=camera)
+
+
+def test_behind_the_catheter_is_the_picture_in_which_it_was_found(tmp_path):
+    """However much later than the newest pose the picture comes; and the words are of the same frame."""
+    given, black = [pose(i) for i in (0, 40)], torch.zeros(3, 480, 640, dtype=torch.uint8)
+    first, second = (CAMERA.project(each.tip).tolist() for each in given)
+    refused, words = Pose.refused(Status.NO_CATHETER, "none"), 'document.getElementById("reason").textContent'
+
+    async def test(server):
+        async with browser(tmp_path) as open_tab:
+            tab = await open_tab(server.address)
+            await tab.until("view.state.offset !== null")
+            start = now() + 60  # so that nothing becomes too old
+
+            async def tip_with(frame: int) -> list[float]:
+                captured = "view.pictures.pictures.camera && view.pictures.pictures.camera.captured"
+                await tab.until(f"{captured} === {start + frame} && view.state.pictured.captured === {start + frame}")
+                return await tab.value("view.tipOnScreen()")
+
+            server.see(black, given[0], start)
+            await shown(server, tab, given[1])
+            assert await tip_with(0) == pytest.approx(first, abs=1e-3)
+            server.see(black, given[1], start + 1)
+            server.send(refused, start + 2)
+            assert await tip_with(1) == pytest.approx(second, abs=1e-3)
+            await tab.until(f"!view.state.refused && {words} === ''")
+            server.see(black, refused, start + 2)
+            assert await tip_with(2) is None  # a second after the last answer
+            await tab.until(f"{words} === 'NO_CATHETER: none'")
+            server.see(black, given[0], start + 3)
+            assert await tip_with(3) == pytest.approx(first, abs=1e-3)
+            assert await tab.value("view.state.malformed") == 0
+
+    run(test)
 
 
 def test_a_panel_shows_a_video_in_time_where_the_user_puts_it(tmp_path):

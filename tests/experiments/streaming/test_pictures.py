@@ -1,6 +1,7 @@
 """Pictures and registered volumes for the page: what is sent, what is skipped, and what is refused."""
 
 import asyncio
+import json
 import struct
 import threading
 
@@ -48,9 +49,13 @@ def test_pictures_reach_the_pages_as_jpeg_of_the_frame_without_distortion():
             found = {}
             while len(found) < 2:
                 content = await asyncio.wait_for(socket.receive_bytes(), 10)
-                channel, captured = struct.unpack("<Bd", content[:9])
+                channel, captured, length = struct.unpack("<BdH", content[:11])
                 assert captured == 12.5
-                found[Channel(channel)] = decoded(content[9:])
+                if length:
+                    assert channel == Channel.CAMERA
+                    pose = json.loads(content[11 : 11 + length])
+                    assert pose.items() >= {"captured": 12.5, "status": "NO_CATHETER", "reason": "none"}.items()
+                found[Channel(channel)] = decoded(content[11 + length :])
             return found
 
     found = asyncio.run(run())

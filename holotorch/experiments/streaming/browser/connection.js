@@ -50,8 +50,7 @@ function clock(message) {
 }
 function pose(message) {
   if (message.kind !== "pose" || !Number.isInteger(message.sequence)) throw new Error("not a pose");
-  const numbers = message.answered ? [...message.tip, ...message.direction, ...message.covariance] : [];
-  if (message.answered && (numbers.length !== 15 || !numbers.every(Number.isFinite))) throw new Error("not finite");
+  checked(message);
   if (state.sequence !== null) {
     if (message.sequence <= state.sequence) return;  // an older pose never replaces a newer one
     state.lost += message.sequence - state.sequence - 1;
@@ -61,4 +60,9 @@ function pose(message) {
   state.pose = message;
   if (message.answered) [state.earlier, state.answered] = [state.answered, message];
   else state.earlier = null;  // a speed is never taken across a refusal
+}
+export function checked(pose) {
+  const numbers = pose.answered ? [...pose.tip, ...pose.direction, ...pose.covariance] : [];
+  if (pose.answered && (numbers.length !== 15 || !numbers.every(Number.isFinite))) throw new Error("not finite");
+  return pose;
 }

@@ -1,10 +1,12 @@
 // Pictures of the server: the tracked frame behind the catheter, and the panel that the user places.
 import { cross, dot, minus, moved, plus, scaled, turned, unit } from "./algebra.js";
+import { checked } from "./connection.js";
 import { picture, textures, upload } from "./drawing.js";
 import { now, state } from "./state.js";
 
 const NAMES = ["camera", "panel"], STALE = 1.0;  // seconds after which a picture is no longer shown
-export const pictures = {};  // by name: { captured, latency, count }
+const HEADER = 11;  // bytes before the pose: channel, time of capture, length of the pose
+export const pictures = {};  // by name: { captured, pose, latency, count }
 // Of the window: place of the left upper corner and width, in shares of it. In a headset: metres, x right, y down, z forward.
 export const onScreen = { x: 0.62, y: 0.05, width: 0.35 };
 export const inSpace = { middle: [0.25, -0.12, 0.9], right: [1, 0, 0], down: [0, 1, 0], width: 0.4 };
@@ -13,17 +15,19 @@ let busy = {};
 export async function takePicture(buffer) {
   const header = new DataView(buffer), name = NAMES[header.getUint8(0)], captured = header.getFloat64(1, true);
   if (!name) throw new Error("a picture of an unknown channel");
+  const start = HEADER + header.getUint16(HEADER - 2, true), words = new Uint8Array(buffer, HEADER, start - HEADER);
+  const pose = words.length ? checked(JSON.parse(new TextDecoder().decode(words))) : null;
   if (busy[name]) return;  // decoding takes longer than a frame: show the next one
   busy[name] = true;
   try {
-    const bitmap = await createImageBitmap(new Blob([new Uint8Array(buffer, 9)], { type: "image/jpeg" }));
+    const bitmap = await createImageBitmap(new Blob([new Uint8Array(buffer, start)], { type: "image/jpeg" }));
     upload(name, bitmap);
     bitmap.close();
     const latency = state.offset === null ? null : now() + state.offset - captured;
-    pictures[name] = { captured, latency, count: (pictures[name] ? pictures[name].count : 0) + 1 };
+    pictures[name] = { captured, pose, latency, count: (pictures[name] ? pictures[name].count : 0) + 1 };
   } finally { busy[name] = false; }
 }
-const fresh = (name) => pictures[name] && state.offset !== null && now() + state.offset - pictures[name].captured < STALE;
+export const fresh = (name) => pictures[name] && state.offset !== null && now() + state.offset - pictures[name].captured < STALE;
 const SCREEN = new Float64Array([2, 0, 0, 0, 0, -2, 0, 0, 0, 0, 1, 0, -1, 1, 0, 1]);  // shares of the window
 
 export function background() {  // the tracked frame fills the picture of the camera

@@ -42,7 +42,7 @@ function onScreen(point) {  // in pixels of the picture, as the camera counts th
   const v = apply(looking().matrix, point), [, , w, h] = area(), { width, height } = camera() || { width: w, height: h };
   return [(v[0] / v[3] + 1) / 2 * width - 0.5, (1 - v[1] / v[3]) / 2 * height - 0.5];
 }
-function tipOnScreen() { return state.drawn && state.answered ? onScreen(current().tip) : null; }  // null: not drawn
+function tipOnScreen() { return state.drawn && current() ? onScreen(current().tip) : null; }  // null: not drawn
 
 function scene() {
   const ratio = window.devicePixelRatio || 1;
@@ -52,7 +52,7 @@ function scene() {
   const all = [0, 0, canvas.width, canvas.height];
   clear(all, [0.08, 0.09, 0.11, 1]);
   clear(area(), [0.13, 0.15, 0.18, 1]);
-  freshness();
+  freshness(camera() && pictures.fresh("camera") ? pictures.pictures.camera.pose : null);
   const { matrix } = looking();
   if (camera()) pictures.background();
   sliceInPlace(matrix);
@@ -67,7 +67,7 @@ function scene() {
 // ---- words
 let frames = 0, counted = now(), written = 0;
 function words() {
-  const { pose } = state;
+  const pose = state.shown || state.pose;
   const reason = !state.connected ? "no connection to the server; trying again"
     : !pose ? "waiting for a pose"
     : !pose.answered ? `${pose.status}: ${pose.reason}`
