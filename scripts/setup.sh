@@ -19,6 +19,16 @@ explain() {  # the last lines of a failed installation, and what they usually me
     fail "Installation failed; the whole output is in $1."
 }
 
+progress() {  # of pip, whose lines come in: signs of life every few seconds
+    local line packages=0
+    while IFS= read -r line; do
+        case "$line" in
+        Collecting*) packages=$((packages + 1)); [ $((packages % 10)) -ne 0 ] || echo "  $packages packages ..." ;;
+        "Installing collected"*) echo "  unpacking them" ;;
+        esac
+    done
+}
+
 python=$(find_python)
 [ -n "$python" ] || fail "Python 3.11 or newer is needed and none was found on PATH."
 "$python" -c 'import venv, ensurepip' 2>/dev/null ||
@@ -37,7 +47,7 @@ case "$(cat .venv/stamp 2>/dev/null)" in
         "$python" -m venv .venv &&
             .venv/bin/python $pip -e ".$extras" &&
             printf '%s' "$wanted $extras" > .venv/stamp
-    } >"$log" 2>&1 || explain "$log"
+    } 2>&1 | tee "$log" | progress >&2 || explain "$log"
     rm -f "$log"
     ;;
 esac

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from paths import ROOT
 
-NEEDED = ("bash", "cat", "cksum", "dirname", "mktemp", "rm", "tail", "grep", "mkdir", "chmod")
+NEEDED = ("bash", "cat", "cksum", "dirname", "mktemp", "rm", "tail", "tee", "grep", "mkdir", "chmod")
 
 
 @pytest.fixture
@@ -97,6 +97,13 @@ def test_installs_once_and_again_when_the_constraints_change(checkout):
         stream.write("# changed\n")
     call(checkout, "demo.sh")
     assert installs() == [".", ".[dev]", "."]
+
+
+def test_a_long_installation_shows_that_it_goes_on(checkout):
+    pip = 'for i in {1..25}; do echo "Collecting p$i"; done; echo "Installing collected packages: p1"'
+    stand_in(checkout, WORKING.replace("PIP", pip.replace("'", "")))
+    said = call(checkout).stderr.splitlines()
+    assert said[1:4] == ["  10 packages ...", "  20 packages ...", "  unpacking them"]
 
 
 def test_all_tests_run_in_several_processes_and_chosen_ones_in_one(checkout):

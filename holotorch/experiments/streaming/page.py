@@ -274,6 +274,7 @@ class _Client:
 
 def _words(pose: Pose, captured: float) -> dict[str, Any]:
     """What a page is told of a pose or refusal."""
+    assert isinstance(pose.status, Status)  # one pose
     said = {"captured": captured, "status": pose.status.name, "answered": pose.answered, "reason": pose.reason}
     if pose.answered:
         covariance = pose.covariance[:3, :3].flatten().tolist()

@@ -240,7 +240,8 @@ def receivers_of(
 
 def _config_error(error: OSError) -> Exception:
     """Convert an error about an address or port to ConfigError; an error about a file stays unchanged."""
-    cure = "; end the other program, or choose another --port or --page HOST:PORT" * (error.errno == errno.EADDRINUSE)
+    other = "; end the other program, or choose another port (--page HOST:PORT for a page, otherwise --port or --igtl)"
+    cure = other if error.errno == errno.EADDRINUSE else ""
     return ConfigError([f"{error.strerror or error}{cure}"]) if error.filename is None else error
 
 

@@ -150,7 +150,8 @@ _ADVICE = {
     Status.EDGES_UNCLEAR: _LONGER,
     Status.OUT_OF_FRAME: "the bands must lie within the picture",
     Status.OUTSIDE_CAMERA: "the camera's file says nothing there: calibrate with boards near the picture's edges",
-    Status.INCONSISTENT: "no pose explains the edges: are `edges` and camera right, and all bands free?",
+    Status.INCONSISTENT: "no pose explains what was measured: are `edges`, `radius` (half the thickness) and camera "
+    "right, and all bands free?",
     Status.UNCERTAIN: _LONGER,
 }
 
@@ -167,12 +168,17 @@ def verdict(summary: dict[str, Any]) -> str:
 
 
 def refusals(summary: dict[str, Any]) -> list[str]:
-    """A line with the commonest refusal and what to look at, if a quarter of the frames or more have no pose."""
+    """The common refusals with an example and what to look at, if a quarter of the frames or more have no pose."""
     counts = {name: count for name, count in summary["statuses"].items() if not Status[name].answered}
     if not counts or 4 * summary["answered"] > 3 * summary["frames"]:
         return []
-    commonest = max(counts, key=lambda name: counts[name])
-    return [f"Refused    most often {commonest}: {_ADVICE[Status[commonest]]}"]
+    most, lines = max(counts.values()), []
+    for name in sorted(counts, key=lambda name: -counts[name]):
+        if 3 * counts[name] >= most:
+            example = summary["pictures"].get(name)
+            such = f", such as {example}" if example else f" {name}"
+            lines.append(f"Refused    {counts[name]}{such}; {_ADVICE[Status[name]]}")
+    return lines
 
 
 def save_figure(folder: Path, log: Log) -> None:

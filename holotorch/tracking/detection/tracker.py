@@ -121,7 +121,8 @@ class CatheterTracker(nn.Module):
     Args:
         camera: Intrinsics and tone curve.
         catheter: Catheter to track; its colours must be saturated, with hues at least 25 degrees apart.
-        most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN.
+        most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN. It is that of the
+            edges' own deviations; the stated one is larger where edges agree less well than these say.
         readout: Standard deviation in metres, along each axis, of the motion of the catheter while a rolling shutter
             reads the rows of a frame. A frame does not show this motion, so that it is in each covariance. 0 for a
             camera with a global shutter, or a catheter at rest. A ``refinement`` has its own, in its plan.

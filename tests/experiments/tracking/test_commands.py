@@ -262,12 +262,16 @@ def test_calibrate_does_not_write_over_a_file(capsys):
 
 
 def test_a_run_with_few_poses_says_what_to_look_at():
-    summary = {"statuses": {"OK": 3, "INCONSISTENT": 4, "TOO_NARROW": 1}, "answered": 3, "frames": 8}
-    (line,) = refusals(summary)
-    assert line.startswith("Refused    most often INCONSISTENT: no pose explains the edges: are `edges`")
+    statuses = {"OK": 3, "UNCERTAIN": 2, "INCONSISTENT": 4, "TOO_NARROW": 1}
+    pictures = {"INCONSISTENT": "frame 2, INCONSISTENT: 0.45 times as wide as it should be at 0.48 m"}
+    wide, uncertain = refusals({"statuses": statuses, "answered": 3, "frames": 10, "pictures": pictures})
+    assert wide.startswith(
+        "Refused    4, such as frame 2, INCONSISTENT: 0.45 times as wide as it should be at 0.48 m; no"
+    )
+    assert "`radius` (half the thickness)" in wide and uncertain.startswith("Refused    2 UNCERTAIN; longer bands")
     assert not refusals({"statuses": {"OK": 7, "NO_AXIS": 2}, "answered": 7, "frames": 9})
     for status in Status:
-        summary = {"statuses": {status.name: 2}, "answered": 0, "frames": 2}
+        summary = {"statuses": {status.name: 2}, "answered": 0, "frames": 2, "pictures": {}}
         assert len(refusals(summary)) == (not status.answered)
 
 
