@@ -44,6 +44,7 @@ from holotorch.tracking.streaming.packet import FRAME, now
 PORT = 8765
 _FOLDER = Path(__file__).with_name("browser")
 _LONGEST = 4096  # bytes of a message from a page, and characters of a reason sent to it
+_ENDED = b"ended"  # tells a page that there will be no more poses
 _REPLIES = 16  # answers that wait for a page
 _PATIENCE = 5.0  # seconds that a page may take to accept a message
 _HEADERS = headers(
@@ -132,7 +133,7 @@ class PageServer:
             await asyncio.to_thread(thread.close)
         for client in list(self._clients):
             with suppress(TimeoutError):
-                await asyncio.wait_for(client.socket.close(), 1.0)
+                await asyncio.wait_for(client.socket.close(message=_ENDED), 1.0)
         if self._runner is not None:
             await self._runner.cleanup()
 

@@ -194,7 +194,9 @@ def test_two_pages_lost_messages_and_a_server_that_dies(tmp_path, monkeypatch):
                 x, y = CAMERA.project(pose(7).tip).tolist()
                 found = await tab.value("view.tipOnScreen()")
                 assert math.dist(found, (x, y)) < 1e-3
-            await server.__aexit__()
+            with monkeypatch.context() as patch:
+                patch.setattr(module, "_ENDED", b"")  # as a server that dies
+                await server.__aexit__()
             words = 'document.getElementById("reason").textContent'
             for tab in tabs:
                 await tab.until(f"!view.state.connected && {words}.startsWith('no connection')")
@@ -203,6 +205,10 @@ def test_two_pages_lost_messages_and_a_server_that_dies(tmp_path, monkeypatch):
                     await tab.until("view.state.connected && view.state.offset !== null")
                     await shown(other, tab, pose(9))
                     assert await tab.value("view.state.drawn")
+            for tab in tabs:
+                await tab.until(f"!view.state.connected && {words} === 'the stream has ended'")
+            await asyncio.sleep(1.5)  # it tries again, in vain
+            assert await tabs[0].value(words) == "the stream has ended"
 
     run(test)
 

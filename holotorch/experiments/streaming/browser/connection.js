@@ -16,7 +16,7 @@ export function connect(handlers, wait = 250) {
   opened.binaryType = "arraybuffer";
   opened.onopen = () => {
     socket = opened;
-    Object.assign(state, { connected: true, sequence: null, roundTrip: Infinity });
+    Object.assign(state, { connected: true, ended: false, sequence: null, roundTrip: Infinity });
     const ask = () => send({ kind: "clock", asked: now() });
     for (const later of [0, 50, 100, 200, 400]) setTimeout(ask, later);  // a busy page answers its first one late
     timer = setInterval(ask, 1000);
@@ -28,8 +28,9 @@ export function connect(handlers, wait = 250) {
       else take(JSON.parse(event.data), handlers);
     } catch (error) { state.malformed += 1; state.error = String(error); }
   };
-  opened.onclose = () => {
+  opened.onclose = (event) => {
     clearInterval(timer);
+    state.ended = event.reason === "ended" || (state.ended && event.code !== 1000);  // and the next tries fail
     state.connected = false;
     handlers.changed();
     setTimeout(() => connect(handlers, Math.min(2 * wait, 2000)), wait);

@@ -5,7 +5,7 @@ const FADES = 0.25, GONE = 1.0;  // age of a pose at which it begins to fade, an
 const AHEAD = 0.1, GAP = 0.25;   // longest prediction, and longest time between two poses that give a speed
 
 export const state = {
-  connected: false, setup: null, pose: null, answered: null, received: 0, lost: 0, malformed: 0, sequence: null,
+  connected: false, ended: false, setup: null, pose: null, answered: null, received: 0, lost: 0, malformed: 0, sequence: null,
   pictured: null, shown: null, placed: null,  // pose of the picture, newest pose or refusal shown, pose drawn
   offset: null, roundTrip: Infinity, latency: null, rate: 0, mode: "camera", drawn: false, alpha: 0, error: "",
   refused: false, headset: "", predict: false, earlier: null,

@@ -68,7 +68,7 @@ function scene() {
 let frames = 0, counted = now(), written = 0;
 function words() {
   const pose = state.shown || state.pose;
-  const reason = !state.connected ? "no connection to the server; trying again"
+  const reason = !state.connected ? (state.ended ? "the stream has ended" : "no connection to the server; trying again")
     : !pose ? "waiting for a pose"
     : !pose.answered ? `${pose.status}: ${pose.reason}`
     : state.alpha < 1 ? "the newest pose is old" : "";
