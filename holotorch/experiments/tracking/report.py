@@ -1,6 +1,7 @@
 """Report of a tracking run: counts by status, time per stage, stability, and the section of the report page."""
 
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -76,6 +77,8 @@ class Log:
     seconds: list[float] = field(default_factory=list)  # time of the tracker for each frame that could be read
     stages: list[dict[str, float]] = field(default_factory=list)  # seconds of each stage of the tracker, by frame
     pictures: dict[str, str] = field(default_factory=dict)  # captions of the overlays by status
+    # Refused frames and the first of them, by status and reason without its numbers.
+    refused: dict[tuple[str, str], tuple[int, str]] = field(default_factory=dict)
 
     def wants(self, item: Tracked) -> bool:
         """Whether the page will show the overlay of this frame."""
@@ -87,8 +90,11 @@ class Log:
         if drawn is not None and self.wants(item):
             smaller = avg_pool2d(drawn.double() / 255, max(1, min(drawn.shape[-2:]) // 400))
             save_picture(self.images / item.status.name, smaller)
-            reason = f": {pose.reason}" if pose.reason else ""
-            self.pictures[item.status.name] = f"frame {item.number}, {item.status.name}{reason}"
+            self.pictures[item.status.name] = _caption(item)
+        if not pose.answered:
+            kind = item.status.name, re.sub(r"\d+(\.\d+)?", "#", pose.reason)
+            count, first = self.refused.get(kind, (0, _caption(item)))
+            self.refused[kind] = count + 1, first
         self.statuses.append(item.status)
         self.times.append(item.frame.seconds)
         self.tips.append(pose.tip.tolist() if pose.answered else [math.nan] * 3)
@@ -99,11 +105,17 @@ class Log:
             self.stages.append(item.stages)
 
 
+def _caption(item: Tracked) -> str:
+    return f"frame {item.number}, {item.status.name}" + (f": {item.pose.reason}" if item.pose.reason else "")
+
+
 def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, Any]:
     """The summary of a run as plain JSON values; keys name their units (mm, ms)."""
     answered = sum(status.answered for status in log.statuses)
     summary: dict[str, Any] = {"experiment": "track", "status": "", "source": frames.name, "method": method}
     summary |= {"frames": len(log.statuses), "answered": answered, "statuses": counts(log.statuses)}
+    common = sorted(log.refused.items(), key=lambda each: -each[1][0])[:_SHOWN]
+    summary["refused"] = [{"status": kind[0], "frames": n, "first": first} for kind, (n, first) in common]
     summary |= {"seconds": log.times[-1] - log.times[0], "stated_rate_hz": frames.rate}
     stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
     if answered:
@@ -168,17 +180,12 @@ def verdict(summary: dict[str, Any]) -> str:
 
 
 def refusals(summary: dict[str, Any]) -> list[str]:
-    """The common refusals with an example and what to look at, if a quarter of the frames or more have no pose."""
-    counts = {name: count for name, count in summary["statuses"].items() if not Status[name].answered}
-    if not counts or 4 * summary["answered"] > 3 * summary["frames"]:
+    """The common refusals and what to look at, if a quarter of the frames or more have no pose."""
+    refused = summary.get("refused")  # none in runs of before
+    if not refused or 4 * summary["answered"] > 3 * summary["frames"]:
         return []
-    most, lines = max(counts.values()), []
-    for name in sorted(counts, key=lambda name: -counts[name]):
-        if 3 * counts[name] >= most:
-            example = summary["pictures"].get(name)
-            such = f", such as {example}" if example else f" {name}"
-            lines.append(f"Refused    {counts[name]}{such}; {_ADVICE[Status[name]]}")
-    return lines
+    common = [each for each in refused if 2 * each["frames"] >= refused[0]["frames"]]
+    return [f"Refused    {each['frames']} like {each['first']}; {_ADVICE[Status[each['status']]]}" for each in common]
 
 
 def save_figure(folder: Path, log: Log) -> None:

@@ -18,9 +18,10 @@ from holotorch.experiments import execute
 from holotorch.experiments.streaming import check as stream_check
 from holotorch.experiments.streaming import stream
 from holotorch.experiments.tracking import run, synthetic
-from holotorch.experiments.tracking.report import refusals
+from holotorch.experiments.tracking.report import Log, Tracked, refusals
 from holotorch.experiments.tracking.synthetic import write_synthetic
-from holotorch.tracking.pose.status import Status
+from holotorch.io.video import Frame
+from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.packet import PosePacket, decode
 
 CONFIGS = paths.CONFIGS / "tracking"
@@ -261,18 +262,29 @@ def test_calibrate_does_not_write_over_a_file(capsys):
     assert Path("camera.yaml").read_text() == "mine"
 
 
-def test_a_run_with_few_poses_says_what_to_look_at():
-    statuses = {"OK": 3, "UNCERTAIN": 2, "INCONSISTENT": 4, "TOO_NARROW": 1}
-    pictures = {"INCONSISTENT": "frame 2, INCONSISTENT: 0.45 times as wide as it should be at 0.48 m"}
-    wide, uncertain = refusals({"statuses": statuses, "answered": 3, "frames": 10, "pictures": pictures})
-    assert wide.startswith(
-        "Refused    4, such as frame 2, INCONSISTENT: 0.45 times as wide as it should be at 0.48 m; no"
-    )
-    assert "`radius` (half the thickness)" in wide and uncertain.startswith("Refused    2 UNCERTAIN; longer bands")
-    assert not refusals({"statuses": {"OK": 7, "NO_AXIS": 2}, "answered": 7, "frames": 9})
+def test_a_run_with_few_poses_says_what_to_look_at(tmp_path):
+    log, frame = Log(tmp_path), Frame(0.0, None)
+    wide = "{} times as wide as it should be at 0.48 m"
+    reasons = [
+        (Status.INCONSISTENT, "no line"),
+        *((Status.INCONSISTENT, wide.format(0.45 + i / 100)) for i in range(4)),
+    ]
+    reasons += [(Status.UNCERTAIN, "tip uncertain to 3.0 mm")] * 2
+    for i, (status, reason) in enumerate(reasons):
+        log.take(Tracked(i, frame, Pose.refused(status, reason), 0.0, {}), None)
+    refused = [{"status": s, "frames": n, "first": first} for (s, _), (n, first) in log.refused.items()]
+    refused.sort(key=lambda each: -each["frames"])
+    first, second = refusals({"refused": refused, "answered": 3, "frames": 10})
+    assert first.startswith(f"Refused    4 like frame 1, INCONSISTENT: {wide.format(0.45)}; no pose explains")
+    assert "`radius` (half the thickness)" in first
+    assert second.startswith("Refused    2 like frame 5, UNCERTAIN: tip uncertain to 3.0 mm; longer bands")
+    assert not refusals({"refused": refused, "answered": 22, "frames": 29})
     for status in Status:
-        summary = {"statuses": {status.name: 2}, "answered": 0, "frames": 2, "pictures": {}}
-        assert len(refusals(summary)) == (not status.answered)
+        if not status.answered:
+            (line,) = refusals(
+                {"refused": [{"status": status.name, "frames": 2, "first": "frame 0"}], "answered": 0, "frames": 2}
+            )
+            assert line.startswith("Refused    2 like frame 0; ")
 
 
 def free_port() -> int:
