@@ -1,6 +1,8 @@
 """Predictions of whole commands beside what is measured: seconds on an idle machine, or with --memory the peak memory.
 
-OMP_NUM_THREADS=1 python scripts/predictions.py [--memory] [--out FILE]
+OMP_NUM_THREADS=1 python scripts/predictions.py [--memory | --charts] [--out FILE]
+
+--charts draws in full every chart that states its memory, in an hour or more, and compares the peak with that.
 """
 
 import argparse
@@ -13,6 +15,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+from holotorch.experiments.chart import CHARTS
 
 # Name and words of ``holotorch run``.
 RUNS = {
@@ -78,22 +82,28 @@ MEMORY_RUNS = {
 }
 
 
-def _carry_out(words: list[str]) -> tuple[dict, float, resource.struct_rusage]:
+def _carry_out(words: list[str], out: Path) -> tuple[float, resource.struct_rusage]:
+    """Seconds that the command ``holotorch`` takes with these words, and what it and its processes use."""
+    started = time.perf_counter()
+    command = [sys.executable, "-m", "holotorch", *words, "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return time.perf_counter() - started, used
+
+
+def _run(words: list[str]) -> tuple[dict, float, resource.struct_rusage]:
     """Plan of ``holotorch run`` with these words, seconds that the command takes, and what it uses."""
     with tempfile.TemporaryDirectory() as folder:
-        out, started = Path(folder) / "run", time.perf_counter()
-        command = [sys.executable, "-m", "holotorch", "run", *words, "--out", str(out)]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            raise subprocess.CalledProcessError(process.returncode, command)
-        return json.loads((out / "plan.json").read_text()), time.perf_counter() - started, used
+        seconds, used = _carry_out(["run", *words], Path(folder) / "run")
+        return json.loads((Path(folder) / "run" / "plan.json").read_text()), seconds, used
 
 
 def _seconds(words: list[str]) -> tuple[str, float]:
     """Words about the seconds of a run, and measured / predicted; on a busy machine the processor works for fewer."""
-    plan, measured, used = _carry_out(words)
+    plan, measured, used = _run(words)
     ratio = measured / max(plan["predicted_seconds"], 1e-3)
     worked = used.ru_utime + used.ru_stime
     return f"{plan['predicted_seconds']:.3g}, {measured:.3g} ({worked:.3g}), {ratio:.2f}", ratio
@@ -101,22 +111,37 @@ def _seconds(words: list[str]) -> tuple[str, float]:
 
 def _memory(words: list[str]) -> tuple[str, float]:
     """Words about the peak memory of a run, and stated / measured."""
-    plan, _, used = _carry_out(words)
+    plan, _, used = _run(words)
+    return _stated(plan["predicted_peak_bytes"], used)
+
+
+def _chart(words: list[str]) -> tuple[str, float]:
+    """Words about the peak memory of a chart, and stated / measured."""
+    with tempfile.TemporaryDirectory() as folder:
+        _, used = _carry_out(["chart", *words], Path(folder))
+    return _stated((CHARTS[words[0]].gigabytes or 0.0) * 1e9, used)
+
+
+def _stated(stated: float, used: resource.struct_rusage) -> tuple[str, float]:
     measured = used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    ratio = plan["predicted_peak_bytes"] / measured
-    return f"{plan['predicted_peak_bytes'] / 1e9:.3f}, {measured / 1e9:.3f}, {ratio:.2f}", ratio
+    ratio = stated / measured
+    return f"{stated / 1e9:.3f}, {measured / 1e9:.3f}, {ratio:.2f}", ratio
 
 
 def main() -> None:
     """Run each configuration in a process of its own and print a line for it, then the factors between the two."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--memory", action="store_true", help="measure the peak memory instead of the seconds")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--memory", action="store_true", help="measure the peak memory instead of the seconds")
+    what.add_argument("--charts", action="store_true", help="measure the peak memory of the charts, in hours")
     parser.add_argument("--out", type=Path, help="file to write the lines to as well")
     parser.add_argument("--only", default="", help="only runs whose name begins like this")
     options = parser.parse_args()
     runs, compare = (MEMORY_RUNS, _memory) if options.memory else (RUNS, _seconds)
+    if options.charts:
+        runs, compare = {f"chart {name}": [name] for name, subject in CHARTS.items() if subject.gigabytes}, _chart
     title = "run: predicted s, measured s (of which the processor worked), measured / predicted"
-    lines = ["run: stated GB, measured GB at the peak, stated / measured" if options.memory else title]
+    lines = [title if compare is _seconds else "run: stated GB, measured GB at the peak, stated / measured"]
     ratios = []
     for name, words in runs.items():
         if not name.startswith(options.only):
@@ -127,7 +152,7 @@ def main() -> None:
         print(lines[-1], flush=True)
     factors = [max(ratio, 1 / ratio) for ratio in ratios]
     lines.append(f"median of the factor between them: {statistics.median(factors):.2f} over {len(ratios)} runs")
-    if options.memory:
+    if compare is not _seconds:
         lines.append(f"largest factor between them: {max(factors):.2f}")
     print("\n".join(lines[len(ratios) + 1 :]))
     if options.out:

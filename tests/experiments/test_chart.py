@@ -10,7 +10,7 @@ import pytest
 
 from holotorch.cli import main
 from holotorch.experiments import chart as charts
-from holotorch.experiments.chart import CHARTS, QUICK_FORM
+from holotorch.experiments.chart import CHARTS, QUICK_FORM, Subject
 from holotorch.experiments.chart_all import PAGE, chart_all
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.propagation import chart as chart_propagation
@@ -47,7 +47,7 @@ def test_a_quick_chart_says_so_and_is_not_beside_the_committed_ones(tmp_path, mo
 
 @pytest.mark.parametrize("subject", CHARTS)
 def test_every_subject_has_a_smaller_quick_form(subject):
-    module = import_module(CHARTS[subject][0])
+    module = import_module(CHARTS[subject].module)
     assert inspect.signature(getattr(module, subject)).parameters["quick"].default is False
     if subject == "stability":  # its quick form takes every other value of the same sweeps
         return
@@ -75,7 +75,7 @@ def stand_ins(monkeypatch):
         for name in list(CHARTS):
             monkeypatch.delitem(charts.CHARTS, name)
         for name in subjects:
-            monkeypatch.setitem(charts.CHARTS, name, ("a module", ""))
+            monkeypatch.setitem(charts.CHARTS, name, Subject("a module"))
         monkeypatch.setattr(charts, "import_module", lambda _: module)
 
     return use
@@ -122,6 +122,20 @@ def test_a_page_of_charts_that_are_all_drawn_is_complete(tmp_path, stand_ins):
     assert [outcome.problem for outcome in outcomes.values()] == [""]
     text = (tmp_path / "new" / PAGE).read_text()
     assert "drawn</span>" not in text and "quick form" not in text and "goal met" in text
+
+
+def test_a_full_chart_says_first_what_it_takes(tmp_path, stand_ins, monkeypatch, capsys):
+    stand_ins(only=drawn("only"))
+    monkeypatch.setitem(charts.CHARTS, "only", Subject("a module", minutes=90, gigabytes=2.25))
+    for free, little in ((4e9, ""), (2e9, ", but only 2.0 GB are free"), (None, "")):
+        monkeypatch.setattr(charts, "available_memory", lambda free=free: free)
+        charts.chart("only", tmp_path)
+        assert capsys.readouterr().err == f"only: about 90 min of a CPU core and 2.2 GB of memory{little}\n"
+    monkeypatch.setitem(charts.CHARTS, "only", Subject("a module"))
+    charts.chart("only", tmp_path)
+    assert capsys.readouterr().err.startswith("only: what it takes has not been measured")
+    charts.chart("only", tmp_path, quick=True)
+    assert capsys.readouterr().err == ""
 
 
 def test_the_front_holds_what_no_other_point_beats():
