@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import torch
 
 from holotorch.hologram.cone import Samples, functions
 
@@ -51,8 +50,7 @@ class Nodes:
             return np.rint(positions).astype(int).tolist(), phasors
         start = np.ceil(positions - self.width / 2).astype(int)
         offset = 2 * (start[:, None] + np.arange(self.width) - positions[:, None]) / self.width
-        inside = torch.from_numpy(self._beta * np.sqrt(np.clip(1 - offset**2, 0, None)))
-        return start.tolist(), torch.special.i0(inside).numpy() * phasors
+        return start.tolist(), np.i0(self._beta * np.sqrt(np.clip(1 - offset**2, 0, None))) * phasors
 
     def response(self, frequency: Samples) -> Samples:
         """Fourier transform of the window; ``frequency`` is axial frequency minus ``centre``, in cycles per metre."""
