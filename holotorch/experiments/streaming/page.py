@@ -4,7 +4,7 @@ A page asks for the clock of this computer and gets the newest pose only; one th
 one that takes none for five seconds is cut off. Poses are JSON: kind, sequence, captured, sent, status, answered,
 reason, lag, and for an answer tip [3] in metres, direction [3] and covariance [9] of the tip in m^2. Pictures are
 binary: a byte for the ``Channel``, the time of capture as a little-endian double, the length of the next part as a
-little-endian uint16, the pose that was found in the picture (captured, status and so on, as above) or nothing, and a
+little-endian uint16, the pose of the catheter in the picture (captured, status and so on, as above) or nothing, and a
 JPEG; again the newest only. The pose is sent with its picture, which arrives later than the newest pose.
 
 On the loopback interface only programs of this computer can connect; requests for other host names, and WebSockets that
@@ -274,7 +274,7 @@ class _Client:
 
 
 def _words(pose: Pose, captured: float) -> dict[str, Any]:
-    """What a page is told of a pose or refusal."""
+    """A pose or refusal as pages get it: tip [3] in metres, direction [3], covariance [9] of the tip in m^2."""
     assert isinstance(pose.status, Status)  # one pose
     said = {"captured": captured, "status": pose.status.name, "answered": pose.answered, "reason": pose.reason}
     if pose.answered:

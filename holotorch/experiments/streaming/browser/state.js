@@ -14,8 +14,8 @@ export const state = {
 
 export function now() { return (performance.timeOrigin + performance.now()) / 1000; }
 
-// Chooses the pose of a frame, and how visible it is: fully, fading, not at all. `pictured` is the pose that was found in
-// the picture behind it, which arrives later than the newest pose; null without a picture.
+// Chooses the pose of a frame, and how visible it is: fully, fading, not at all. `pictured` is the pose in the picture
+// behind it, which arrives later than the newest pose; null without a picture.
 export function freshness(pictured = null) {
   state.pictured = pictured;
   state.shown = pictured || state.pose;
