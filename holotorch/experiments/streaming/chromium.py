@@ -90,7 +90,7 @@ async def browser(folder: Path, size: tuple[int, int] = (800, 600)) -> AsyncIter
                 await tab.call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1],
                                deviceScaleFactor=1, mobile=False)  # fmt: skip
                 await tab.call("Page.navigate", url=address)
-                await tab.until("Boolean(window.view)")
+                await tab.until("document.readyState !== 'loading' && Boolean(window.view)")
                 return tab
 
             yield open_tab
