@@ -144,7 +144,7 @@ class ThermalCrosstalk(PreciseModule):
     @property
     def kernel(self) -> Tensor:
         """The two-dimensional kernel, float64 [h, w], with centre tap 1, with the gradients of what is learned."""
-        return math.prod(self._factors())  # type: ignore[return-value]
+        return _kernel(self._present_taps())
 
     @property
     def sigma_px(self) -> float:
@@ -168,11 +168,11 @@ class ThermalCrosstalk(PreciseModule):
 
     def forward(self, phase: Tensor) -> Tensor:
         """Spread ``phase``, real [..., H, W]; the result has the same shape and unit."""
-        return self._spread(phase, self._factors())
+        return self._spread(phase, self._present_taps())
 
     def adjoint(self, phase: Tensor) -> Tensor:
         """Apply the transpose, which is the correlation with the kernel."""
-        return self._spread(phase, [factor.flip(0, 1) for factor in reversed(self._factors())])
+        return self._spread(phase, _flipped(self._present_taps()))
 
     def extra_repr(self) -> str:
         """Main parameters, for ``print(module)``."""
@@ -195,12 +195,11 @@ class ThermalCrosstalk(PreciseModule):
         """Keep the taps of a kernel that is not learned; those of a learned one are computed in every call."""
         self.keep("taps", None if self.learned else self._computed_taps())
 
-    def _factors(self) -> list[Tensor]:
-        """Kernels whose convolutions make up the whole: column and row of a Gaussian, or the measured kernel."""
-        taps = self._computed_taps() if self.learned else self.taps
-        return [taps] if taps.ndim == 2 else [taps[:, None], taps[None]]
+    def _present_taps(self) -> Tensor:
+        """Taps [n] of the column and of the row of a Gaussian, or the measured kernel [h, w]."""
+        return self._computed_taps() if self.learned else self.taps
 
-    def _spread(self, phase: Tensor, factors: list[Tensor]) -> Tensor:
+    def _spread(self, phase: Tensor, taps: Tensor) -> Tensor:
         checks.real("phase", phase)
         if phase.ndim < 2:
             raise ValueError(f"phase must end in (H, W), got {tuple(phase.shape)}")
@@ -211,27 +210,42 @@ class ThermalCrosstalk(PreciseModule):
                 f"{phase.shape[-1]} px, the last two axes of {tuple(phase.shape)}; give a smaller size or a larger grid"
             )
         phase = at_least_single(phase)
-        if sum(factor.numel() for factor in factors) > _TAPS_OF_FFT:
-            return convolve(phase, math.prod(factors).to(phase))  # type: ignore[union-attr]
+        if taps.numel() * (2 if taps.ndim == 1 else 1) > _TAPS_OF_FFT:
+            return convolve(phase, _kernel(taps).to(phase))
         add = _shifted_sum if torch.compiler.is_compiling() else _ShiftAndAdd.apply
-        for factor in factors:
-            phase = add(phase, factor.to(phase.device))
-        return phase
+        return add(phase, taps.to(phase.device))
 
     def _load_from_state_dict(self, *args, **kwargs):
         super()._load_from_state_dict(*args, **kwargs)
         self._keep_taps()
 
 
+def _kernel(taps: Tensor) -> Tensor:
+    """The kernel [h, w] of taps [h, w], or of taps [n] along both axes."""
+    return taps[:, None] * taps if taps.ndim == 1 else taps
+
+
+def _flipped(taps: Tensor) -> Tensor:
+    return taps.flip(tuple(range(taps.ndim)))
+
+
 def _shifted_sum(image: Tensor, taps: Tensor) -> Tensor:
-    """Convolution of ``image`` [..., H, W] with ``taps`` [h, w] as a sum of shifted copies, one per tap."""
+    """Convolution of ``image`` [..., H, W] with ``taps`` as a sum of shifted copies, one per tap.
+
+    Taps [h, w] are the kernel; taps [n] are its column and its row.
+    """
+    readable = checks.readable(image)  # numbers are faster than tensors
+    if taps.ndim == 1:
+        if not readable:
+            return _shifted_sum(_shifted_sum(image, taps[:, None]), taps[None])
+        numbers = taps.tolist()
+        return _summed_along(_summed_along(image, numbers, -2), numbers, -1)
     rows, columns = taps.shape
-    if min(rows, columns) == 1 and checks.readable(image):
+    if readable and min(rows, columns) == 1:
         return _summed_along(image, taps.flatten().tolist(), -2 if columns == 1 else -1)
     height, width = image.shape[-2:]
     padded = _padded(image, taps.shape)
-    # Numbers are faster than tensors.
-    values = taps.tolist() if checks.readable(image) else [row.unbind() for row in taps.to(image).unbind()]
+    values = taps.tolist() if readable else [row.unbind() for row in taps.to(image).unbind()]
     result = torch.zeros_like(image)
     for i, j in itertools.product(range(rows), range(columns)):
         tap, y, x = values[i][j], rows - 1 - i, columns - 1 - j
@@ -291,17 +305,20 @@ class _ShiftAndAdd(torch.autograd.Function):
     def backward(ctx, *gradients: Tensor):
         image, taps = ctx.saved_tensors
         (gradient,) = gradients
-        of_image = _ShiftAndAdd.apply(gradient, taps.flip(0, 1)) if ctx.needs_input_grad[0] else None
-        of_taps = _correlated(gradient, image, taps.shape) if ctx.needs_input_grad[1] else None
+        of_image = _ShiftAndAdd.apply(gradient, _flipped(taps)) if ctx.needs_input_grad[0] else None
+        of_taps = _correlated(gradient, image, taps) if ctx.needs_input_grad[1] else None
         return of_image, of_taps
 
     @staticmethod
     def jvp(ctx, *tangents: Tensor):
         image, taps = ctx.saved_tensors
         of_image, of_taps = tangents
-        parts = [
-            _ShiftAndAdd.apply(x, k) for x, k in ((of_image, taps), (image, of_taps)) if x is not None and k is not None
-        ]
+        parts = [] if of_image is None else [_ShiftAndAdd.apply(of_image, taps)]
+        if of_taps is not None and taps.ndim == 2:
+            parts.append(_ShiftAndAdd.apply(image, of_taps))
+        elif of_taps is not None:
+            for column, row in ((of_taps, taps), (taps, of_taps)):
+                parts.append(_ShiftAndAdd.apply(_ShiftAndAdd.apply(image, column[:, None]), row[None]))
         return sum(parts[1:], parts[0])
 
 
@@ -309,16 +326,20 @@ class _ShiftAndAdd(torch.autograd.Function):
 setattr(_ShiftAndAdd.forward, "__signature__", inspect.signature(_ShiftAndAdd.forward))  # noqa: B010
 
 
-def _correlated(gradient: Tensor, image: Tensor, size: torch.Size) -> Tensor:
-    """Derivative with respect to the taps, of ``size`` (h, w), for a ``gradient`` with respect to the convolution."""
-    rows, columns = size
+def _correlated(gradient: Tensor, image: Tensor, taps: Tensor) -> Tensor:
+    """Derivative with respect to ``taps`` for a ``gradient`` with respect to the convolution."""
+    if taps.ndim == 1:
+        column, row = taps[:, None], taps[None]
+        of_column = _correlated(_ShiftAndAdd.apply(gradient, row.flip(1)), image, column)
+        return of_column.flatten() + _correlated(gradient, _ShiftAndAdd.apply(image, column), row).flatten()
+    rows, columns = taps.shape
     height, width = image.shape[-2:]
-    padded = _padded(image, size)
+    padded = _padded(image, taps.shape)
     sums = [
         (padded[..., y : y + height, x : x + width] * gradient).sum()
         for y, x in itertools.product(reversed(range(rows)), reversed(range(columns)))
     ]
-    return torch.stack(sums).reshape(size).double()
+    return torch.stack(sums).reshape(taps.shape).double()
 
 
 def _gaussian(offsets: Tensor, sigma: Tensor) -> Tensor:
