@@ -43,6 +43,10 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     calibrate.add_argument("--bands", nargs="+", metavar="PLACE", help=about)
     about = "of a catheter: YAML file whose edges, radius and length are kept (default: configs/tracking/catheter.yaml)"
     calibrate.add_argument("--catheter", type=Path, metavar="FILE", help=about)
+    about = "of a catheter: distances of the edges of its bands from the tip, such as 70mm 108mm 146mm 184mm"
+    calibrate.add_argument("--edges", nargs="+", metavar="LENGTH", help=about)
+    calibrate.add_argument("--radius", metavar="LENGTH", help="of a catheter: half its diameter, such as 1mm")
+    calibrate.add_argument("--length", metavar="LENGTH", help="of a catheter: from its tip on, such as 350mm")
     calibrate.add_argument("--out", type=Path, help="file (default: camera.yaml, headset.yaml or catheter.yaml)")
     calibrate.set_defaults(action=_calibrate)
 
@@ -88,11 +92,14 @@ def _calibrate(options: argparse.Namespace) -> int:
         from holotorch.experiments.tracking.photograph import calibrate_catheter
 
         out = options.out or Path("catheter.yaml")
-        _, lines = calibrate_catheter(options.files[1], options.bands, out, options.catheter)
+        measured = {"edges": f"[{', '.join(options.edges)}]"} if options.edges else {}
+        measured |= {key: value for key in ("radius", "length") if (value := getattr(options, key))}
+        _, lines = calibrate_catheter(options.files[1], options.bands, out, options.catheter, measured)
         print(*lines, out, sep="\n")
         return OK
-    if options.bands or options.catheter:
-        raise ConfigError(["--bands and --catheter belong to: calibrate catheter PHOTOGRAPH"])
+    if any(getattr(options, name) for name in ("bands", "catheter", "edges", "radius", "length")):
+        expected = "--bands, --catheter, --edges, --radius and --length belong to: calibrate catheter PHOTOGRAPH"
+        raise ConfigError([expected])
     if options.files[0] == Path("headset"):
         if len(options.files) != 2 or options.board:
             raise ConfigError(["calibrate headset: expected one file of alignments, and no --board"])

@@ -1,9 +1,10 @@
-"""``holotorch calibrate catheter``: the colours of a catheter's bands from a photograph of it."""
+"""``holotorch calibrate catheter``: the file of a catheter from its lengths and a photograph of its bands."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -18,31 +19,48 @@ from holotorch.tracking.detection.channels import ambiguities, ambiguity_text
 from holotorch.tracking.detection.colours import ColourTable
 
 GEOMETRY = "configs/tracking/catheter.yaml"  # whose edges, radius and length are kept unless another file is named
-_AROUND = 2  # pixels to each side of a position that count too
+_AROUND = 2  # pixels to each side of a position that may count too
+_SURROUNDINGS = 6  # pixels to each side of a position; those on the border of this square are compared with the band
+_LIKE_BAND = 0.7  # of the largest difference from the surroundings: from here on, a pixel counts as one of the band
 _UNEVEN = 25  # levels: deviation within a box above which it probably holds more than one band
 _BRIGHT = 250  # level from which on a channel is probably saturated
+_STAND_INS = ((200, 40, 45), (40, 70, 190))  # colours of neighbouring bands until theirs are read
 _PLACE = re.compile(r"(\d{1,5}),(\d{1,5})(?:,(\d{1,5}),(\d{1,5}))?")
 
 
 def calibrate_catheter(
-    photograph: Path, places: Sequence[str], out: Path, geometry: Path | None = None
+    photograph: Path,
+    places: Sequence[str],
+    out: Path,
+    geometry: Path | None = None,
+    measured: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Catheter, list[str]]:
     """Read the colours of the bands from a photograph and write the catheter to ``out``.
+
+    Near a position, the pixels whose chroma differs most from the surroundings count, so that a thin tube is not mixed
+    with what is behind it; of a box, all do. Their median is the colour.
 
     Args:
         photograph: A picture, or a video or folder whose first frame is taken, in the light of the later frames.
         places: One for each band, from the tip on: a position X,Y in pixels, or a box X0,Y0,X1,Y1 on the band.
         out: YAML file for the catheter; must not exist yet.
         geometry: YAML file whose edges, radius and length are kept; by default that of the dissertation's catheter.
+        measured: Text of ``edges``, ``radius`` or ``length`` as in a file, such as ``[20 mm, 40 mm, 50 mm, 60 mm]``;
+            replaces that of the file.
 
     Returns:
         The catheter, and lines of text about its colours.
 
     Raises:
-        ConfigError: A file cannot be used, a place is none or not on the picture, or the colours cannot be told apart.
+        ConfigError: A file or length cannot be used, a place is none or not on the picture, or the colours cannot be
+            told apart.
     """
     source = geometry or Path(GEOMETRY)
-    tool = build_catheter(load_catheter(find_config(source) or source))
+    overrides = [f"{key}={value}" for key, value in measured.items()]
+    if "edges" in measured:  # there may be more bands than in the file, whose colours are replaced below
+        bands = measured["edges"].count(",")
+        overrides.append(f"colours={[list(_STAND_INS[i % 2]) for i in range(bands)]}")
+    tool = build_catheter(load_catheter(find_config(source) or source, overrides))
     pixels = _pixels(photograph)
     boxes = _boxes(places, len(tool.colours), pixels.shape[-2:])
     if out.exists():
@@ -63,12 +81,13 @@ def calibrate_catheter(
         for i, (level, place, deviation) in enumerate(zip(levels, places, spread, strict=True), 1)
     ]
     edges = ", ".join(f"{1e3 * edge:g}" for edge in tool.edges)
+    kept = [key for key in ("edges", "radius", "length") if key not in measured]
     lines.append(
-        f"Geometry   edges at {edges} mm from the tip, radius {1e3 * tool.radius:g} mm, of {source}: measure yours and "
-        "edit them"
+        f"Geometry   edges at {edges} mm from the tip, radius {1e3 * tool.radius:g} mm, length {1e3 * tool.length:g} mm"
+        + (f"; {' and '.join(kept)} of {source}: measure yours and give --{' --'.join(kept)}" if kept else "")
     )
     notes = [
-        f"band {i} varies much within {place}: choose a box that holds this band alone (a thin tube has none)"
+        f"band {i} varies much within {place}: choose a box that holds this band alone, or a position X,Y on it"
         for i, (place, deviation) in enumerate(zip(places, spread, strict=True), 1)
         if deviation > _UNEVEN
     ]
@@ -110,8 +129,6 @@ def _boxes(places: Sequence[str], bands: int, size: Sequence[int]) -> list[tuple
         if not (box[0] <= box[2] < size[1] and box[1] <= box[3] < size[0]):
             expected = f"places on the picture of {size[1]} x {size[0]} px, X0,Y0 before X1,Y1"
             mistakes.append(f"--bands: expected {expected}, got {place!r}")
-        if not match[3]:
-            box = (max(0, x - _AROUND), max(0, y - _AROUND), x + _AROUND, y + _AROUND)
         boxes.append(box)
     if mistakes:
         raise ConfigError(mistakes)
@@ -119,8 +136,25 @@ def _boxes(places: Sequence[str], bands: int, size: Sequence[int]) -> list[tuple
 
 
 def _colour(pixels: torch.Tensor, box: tuple[int, int, int, int]) -> tuple[tuple[int, int, int], float]:
-    """Median colour within a box, and the largest standard deviation of its channels, in levels."""
+    """Median colour within a box or about a position, and the largest standard deviation of its channels, in levels."""
     x0, y0, x1, y1 = box
-    inside = pixels[:, y0 : y1 + 1, x0 : x1 + 1].flatten(1).numpy().astype(np.float64)
+    if (x0, y0) == (x1, y1):
+        inside = _like_band(pixels, x0, y0)
+    else:
+        inside = pixels[:, y0 : y1 + 1, x0 : x1 + 1].flatten(1).numpy().astype(np.float64)
     red, green, blue = (int(value) for value in np.median(inside, 1).round())
     return (red, green, blue), float(inside.std(1).max())
+
+
+def _like_band(pixels: torch.Tensor, x: int, y: int) -> np.ndarray:
+    """Pixels [3, n] around a position whose chroma is least that of the surroundings; all of them on a wide band."""
+
+    def square(radius: int) -> np.ndarray:
+        rows, columns = slice(max(0, y - radius), y + radius + 1), slice(max(0, x - radius), x + radius + 1)
+        return pixels[:, rows, columns].numpy().astype(np.float64)
+
+    wide, near = square(_SURROUNDINGS), square(_AROUND).reshape(3, -1)
+    border = np.concatenate([wide[:, 0], wide[:, -1], wide[..., 0], wide[..., -1]], 1)
+    behind = np.median(border - border.mean(0), 1, keepdims=True)
+    away = np.linalg.norm(near - near.mean(0) - behind, axis=0)  # gloss, which has no chroma, does not stand out
+    return near[:, away >= _LIKE_BAND * away.max()] if away.max() > _UNEVEN else near

@@ -69,6 +69,44 @@ def test_a_box_counts_its_median_and_keeps_the_geometry_of_a_file(capsys):
     assert "new/mine.yaml exists already" in capsys.readouterr().err
 
 
+def test_a_position_on_a_thin_tube_gives_its_colour_and_not_that_of_its_surroundings(capsys):
+    """A tube of three pixels with gloss, on a coloured background; the same positions with boxes take most of both."""
+    colours, behind = ((200, 60, 40), (40, 160, 70), (50, 60, 190)), (90, 110, 150)
+    picture = np.full((60, 90, 3), behind, np.uint8)
+    for i, colour in enumerate(colours):
+        picture[29:32, 30 * i : 30 * i + 30] = colour
+    picture[29, ::2] = 245  # gloss
+    cv2.imwrite("bands.png", np.ascontiguousarray(picture[..., ::-1]))
+    assert main(["calibrate", "catheter", "bands.png", "--bands", "15,31", "45,30", "75,30"]) == 0
+    assert build_catheter(load_catheter("catheter.yaml")).colours == colours
+    assert "varies much" not in capsys.readouterr().out
+    boxes = ["13,28,17,34", "43,28,47,34", "73,28,77,34"]
+    assert main(["calibrate", "catheter", "bands.png", "--out", "boxes.yaml", "--bands", *boxes]) == 2
+    assert "found 13,28,17,34: [90, 110, 150]" in capsys.readouterr().err
+
+
+def test_lengths_are_given_with_the_photograph(capsys):
+    """Of more bands than the dissertation's catheter has; what is not given is kept, and said to be."""
+    picture = np.full((60, 120, 3), 128, np.uint8)
+    colours = ((200, 30, 40), (40, 180, 60), (50, 60, 200), (220, 170, 30))
+    for i, colour in enumerate(colours):
+        picture[20:30, 30 * i : 30 * i + 30] = colour[::-1]
+    cv2.imwrite("bands.png", picture)
+    words = ["--bands", "15,25", "45,25", "75,25", "105,25", "--edges", "20mm", "32", "mm", "5cm", "60mm", "71mm"]
+    assert main(["calibrate", "catheter", "bands.png", *words]) == 2
+    assert "expected a length" in capsys.readouterr().err
+    words[words.index("32") : words.index("mm") + 1] = ["32mm"]
+    assert main(["calibrate", "catheter", "bands.png", *words, "--radius", "0.8mm"]) == 0
+    tool, out = build_catheter(load_catheter("catheter.yaml")), capsys.readouterr().out
+    assert (tool.edges, tool.radius, tool.length) == ((0.02, 0.032, 0.05, 0.06, 0.071), 8e-4, 0.35)
+    assert (
+        tool.colours == colours and "; length of configs/tracking/catheter.yaml: measure yours and give --length" in out
+    )
+    words += ["--radius", "0.8mm", "--length", "0.4m", "--out", "whole.yaml"]
+    assert main(["calibrate", "catheter", "bands.png", *words]) == 0
+    assert build_catheter(load_catheter("whole.yaml")).length == 0.4 and "measure yours" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -107,7 +145,7 @@ def grey() -> np.ndarray:
 
 def test_options_of_a_catheter_belong_to_it(capsys):
     assert main(["calibrate", "a.png", "--bands", "1,1"]) == 2
-    assert "--bands and --catheter belong to: calibrate catheter PHOTOGRAPH" in capsys.readouterr().err
+    assert "--radius and --length belong to: calibrate catheter PHOTOGRAPH" in capsys.readouterr().err
 
 
 TOOLS = {
