@@ -16,7 +16,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.folder import claim
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.tracking import devices
-from holotorch.experiments.tracking.forecast import working_range
+from holotorch.experiments.tracking.forecast import HALF, working_range
 from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import Recorder, is_recording
@@ -32,7 +32,7 @@ VIDEO = "video.avi"  # Motion JPEG: unlike MPEG-4 it keeps the band edges sharp 
 _SIZE = (1080, 1920)  # (H, W) for a camera without a frame size
 _SWING = 45  # frames after which the motion repeats
 _DISTANCE = 0.5  # metres: usual mean distance of the middle of the bands from the camera
-_SHARE = 0.75  # of the working range: the bands are tilted by up to 23 degrees and swing 6 % farther away
+_SHARE = 0.8  # of the working range: the bands are tilted by up to 23 degrees and swing 6 % farther away
 _TIP, _COVARIANCE = COLUMNS[5:8], COLUMNS[11:17]
 _TRUTH = ("frame", "time_s", *COLUMNS[5:11])  # columns of truth.csv
 _WRONG = 5.0  # mm: error above which a pose counts as wrong
@@ -89,10 +89,11 @@ def synthetic_world(camera: Path | None, catheter: Path | None, size: tuple[int,
 def synthetic_distance(world: World) -> float:
     """Mean distance in metres of the middle of the bands from the camera.
 
-    It is 0.5 m, or three quarters of :func:`working_range` where that is less. It is not so small that the bands leave
-    the frame or that the tube is too close to be rendered; if that is so up to 0.5 m, it is 0.5 m.
+    It is 0.5 m, or four fifths of :func:`working_range` in colours of half the resolution where that is less, so that
+    the video can be tracked too. It is not so small that the bands leave the frame or that the tube is too close to be
+    rendered; if that is so up to 0.5 m, it is 0.5 m.
     """
-    near = _SHARE * working_range(world.camera, world.catheter)[0]
+    near = _SHARE * working_range(world.camera, world.catheter, HALF)[0]
     if near >= _DISTANCE:
         return _DISTANCE
     for step in range(_SWING):
@@ -104,14 +105,15 @@ def synthetic_distance(world: World) -> float:
 
 def distance_text(world: World) -> str:
     """A line with :func:`synthetic_distance` and its reason, to follow that of the working range."""
-    distance, largest = synthetic_distance(world), working_range(world.camera, world.catheter)[0]
+    distance, largest = synthetic_distance(world), working_range(world.camera, world.catheter, HALF)[0]
     if _SHARE * largest >= _DISTANCE:
-        reason = "well within that range"
+        reason = "well within the range"
     elif distance == _SHARE * largest:
-        reason = f"three quarters of that range, since the usual {_DISTANCE:g} m is too close to its end or beyond it"
+        reason = f"four fifths of the range in such colours, since the usual {_DISTANCE:g} m is too far for its video"
     else:
         reason = "any nearer, its bands would leave the frame, or the tube come within ten radii of the camera"
-        reason += "" if distance < largest else "; this is beyond that range, so few frames or none will have a pose"
+        if distance >= largest:
+            reason += "; this is beyond the range in such colours, so that few frames of its video will have a pose"
     return f"Distance   the bands of the synthetic catheter are about {distance:.2g} m from the camera: {reason}"
 
 

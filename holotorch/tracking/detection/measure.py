@@ -43,6 +43,8 @@ class EdgeWindow:
     close: int = 7  # the same for edges that cannot be measured in the whole window
     outside: int = 10  # distance beyond an outermost edge, plus two blurs, up to which samples have weight
     aside: float = 0.9  # distance outside the side of the tube from which on a row of samples has no weight
+    leak: float = 0.75  # distance outside the side at which the background is read that leaks into the rows of the tube
+    leaking: float = 0.3  # standard deviation of the fraction of the background that leaks into a row
     white: int = 252  # highest 8-bit level that is surely not saturated
     saturated: float = 0.1  # fraction of saturated samples from which on a row has no weight
 
@@ -221,11 +223,21 @@ def measure_edges(
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
         coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
         shading, looks = fit, looks - 1
+        core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
         if coarse:
             fit, shading = fit_luma(fit, light, shown, sampler.light, along)
-        elif bool((fit.deviation > _LIMITS.unsure).any()) and not _astray(fit, looks):
-            core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
+        elif not _astray(fit, looks):
             fit = shading = _refitted(fit, light, weight, blur, along, core)
+        if _unsure(fit) and not _astray(fit, looks):
+            sides = _SIGNS[::3] * (widths[:, None, None] / 2 + _WINDOW.leak)
+            behind = sampler.sharp(lens.distort(line.plane(near[:, None, None] + along[:, None], sides)))
+            light = _without_background(light, weight, fit, along, behind.transpose(1, 2, 3, 0))
+            other = fit_edges(light, weight, blur, t=along)
+            if coarse:
+                other, other_shading = fit_luma(other, light, shown, sampler.light, along)
+            else:
+                other = other_shading = _refitted(other, light, weight, blur, along, core)
+            fit, shading = fit.or_better(other), shading.or_better(other_shading)
         near = near + fit.place
         if not _astray(fit, looks):
             break
@@ -254,20 +266,53 @@ def measure_edges(
     )
 
 
+def _without_background(
+    light: np.ndarray, weight: np.ndarray, fit: EdgeFit, along: np.ndarray, behind: np.ndarray
+) -> np.ndarray:
+    """Light [E, T, U, C] minus what leaks into its rows from the background ``behind`` [E, T, 2, C] on both sides.
+
+    The blur of the frame and the sampling between pixels mix the background into the rows of a thin tube. The fraction
+    of each side in each row, the same in all channels, is fitted by least squares together with the levels and the step
+    of the ``fit``, whose other arguments are ``light``, ``weight`` and ``along``. A background that is even, or changes
+    only where the edge is, does not tell the fraction, which then is about 0.
+    """
+    light, weight = light.astype(np.float64), weight.astype(np.float64)
+    total = np.maximum(weight.sum(1, keepdims=True), 1e-30)
+    rise = np.broadcast_to(ndtr((along - fit.place[:, None]) / fit.blur[:, None])[..., None, None], light.shape)
+    rise = rise - (weight * rise).sum(1, keepdims=True) / total
+    power = np.maximum((weight * rise * rise).sum(1, keepdims=True), 1e-30)
+
+    def unexplained(values: np.ndarray) -> np.ndarray:
+        """Part of ``values`` [E, T, U, C] that is neither constant along the tube nor like the step."""
+        values = values - (weight * values).sum(1, keepdims=True) / total
+        return values - rise * ((weight * rise * values).sum(1, keepdims=True) / power)
+
+    behind = behind.astype(np.float64) - behind.mean(1, keepdims=True)
+    sides = np.stack([unexplained(behind[:, :, side, None]) for side in range(2)], -1)  # [E, T, U, C, 2]
+    weighed = weight[..., None] * sides
+    normal = np.einsum("etuci,etucj->euij", weighed, sides) + np.eye(2) / _WINDOW.leaking**2
+    leak = np.linalg.solve(normal, np.einsum("etuci,etuc->eui", weighed, unexplained(light))[..., None])
+    return light - np.einsum("eui,etic->etuc", leak[..., 0], behind)
+
+
 def _refitted(
     fit: EdgeFit, light: np.ndarray, weight: np.ndarray, blur: float, along: np.ndarray, core: np.ndarray
 ) -> EdgeFit:
-    """For each unsure edge the best of the ``fit``, one of the middle rows, and one of the samples near the edge.
+    """For each edge the best of the ``fit``, and if some are unsure of fits to the middle rows and near the edge.
 
     Arguments as for :func:`fit_edges`; ``core`` [E, U] are the weights of the middle rows.
     """
-    # Light of an uneven background leaks into the outer rows.
-    fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
-    if bool((fit.deviation > _LIMITS.unsure).any()):
+    if _unsure(fit):  # light of an uneven background leaks into the outer rows
+        fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
+    if _unsure(fit):
         # A stain or a shadow on the tube is a second edge in the window of an edge beside it.
         close = (np.abs(along) <= _WINDOW.close + 2 * blur)[:, None, None]
         fit = fit.or_better(fit_edges(light, weight * close, blur, t=along))
     return fit
+
+
+def _unsure(fit: EdgeFit) -> bool:
+    return bool((fit.deviation > _LIMITS.unsure).any())
 
 
 def _shows_tube(tube: np.ndarray, beside: np.ndarray) -> bool:

@@ -121,8 +121,7 @@ class CatheterTracker(nn.Module):
     Args:
         camera: Intrinsics and tone curve.
         catheter: Catheter to track; its colours must be saturated, with hues at least 25 degrees apart.
-        most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN. It is that of the
-            edges' own deviations; the stated one is larger where edges agree less well than these say.
+        most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN.
         readout: Standard deviation in metres, along each axis, of the motion of the catheter while a rolling shutter
             reads the rows of a frame. A frame does not show this motion, so that it is in each covariance. 0 for a
             camera with a global shutter, or a catheter at rest. A ``refinement`` has its own, in its plan.
@@ -205,8 +204,7 @@ class CatheterTracker(nn.Module):
         for i, pose in zip(chosen, fitted, strict=True):
             poses[i] = pose
             if pose.answered and float(pose.tip_sd) > self.most_sd:
-                text = f"tip uncertain to {1e3 * float(pose.tip_sd):.1f} mm, above {1e3 * self.most_sd:g} mm"
-                poses[i] = Pose.refused(Status.UNCERTAIN, text)
+                poses[i] = Pose.refused(Status.UNCERTAIN, _uncertain(float(pose.tip_sd), self.most_sd))
         return poses
 
     def _track(self, frame: Tensor, before: Pose | None) -> Pose:
@@ -538,16 +536,14 @@ class CatheterTracker(nn.Module):
             depth = float((line_pose.tip + sum(self._positions) / len(self._positions) * line_pose.direction)[2])
             text = f"{ratio:.2f} times as wide as it should be at {depth:.2f} m"
             raise Refusal(Status.INCONSISTENT, text, final=True)
-        moved_in_readout = self._read_out(line_pose, height)
-        tip_sd = math.sqrt(line_pose.tip_sd**2 + float(moved_in_readout.diagonal()[:3].sum()))
-        if tip_sd > self.most_sd:
-            text = f"tip uncertain to {1e3 * tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
-            raise Refusal(Status.UNCERTAIN, text, final=True)
         # Edges that agree less well than their deviations say are that much less certain (the scale factor of Birge).
         scale = max(1.0, line_pose.chi_square / max(freedom, 1))
+        covariance = scale * line_pose.covariance + self._read_out(line_pose, height)
+        tip_sd = math.sqrt(float(covariance.diagonal()[:3].sum()))
+        if tip_sd > self.most_sd:
+            raise Refusal(Status.UNCERTAIN, _uncertain(tip_sd, self.most_sd), final=True)
         status = Status.OK if freedom else Status.UNVERIFIED
         reason = "" if freedom else THREE_EDGES
-        covariance = scale * line_pose.covariance + moved_in_readout
         tip, direction, covariance = map(torch.from_numpy, (line_pose.tip, line_pose.direction, covariance))
         chi_square, degrees = torch.from_numpy(np.array([line_pose.chi_square, freedom], dtype=np.float64))
         return Pose(tip, direction, covariance, chi_square, degrees, status, reason)
@@ -559,6 +555,10 @@ class CatheterTracker(nn.Module):
             yield
         finally:
             self.times[stage] += time.perf_counter() - began
+
+
+def _uncertain(tip_sd: float, most_sd: float) -> str:
+    return f"tip uncertain to {1e3 * tip_sd:.3g} mm, above {1e3 * most_sd:g} mm"
 
 
 def _chi_square_limits(edges: int) -> list[float]:

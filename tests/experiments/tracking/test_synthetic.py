@@ -15,7 +15,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking import run as tracking_run
 from holotorch.experiments.tracking import synthetic
 from holotorch.experiments.tracking.devices import build_camera, build_catheter, load_camera, load_catheter
-from holotorch.experiments.tracking.forecast import working_range
+from holotorch.experiments.tracking.forecast import HALF, working_range
 from holotorch.experiments.tracking.synthetic import (
     RATE,
     compared,
@@ -202,7 +202,7 @@ def small(folder, bands):
 
 def test_the_usual_camera_and_catheter_stay_where_they_were():
     world = World()
-    assert synthetic_distance(world) == 0.5 and "0.5 m from the camera: well within" in distance_text(world)
+    assert synthetic_distance(world) == 0.5 and "0.5 m from the camera: well within the range" in distance_text(world)
     poses = synthetic_poses(world, 90, 0.5)
     assert len(poses) == 90
     for i, pose in enumerate(poses):
@@ -214,7 +214,7 @@ def test_the_usual_camera_and_catheter_stay_where_they_were():
 
 def test_short_bands_before_a_small_camera_come_nearer_and_are_found(tmp_path, capsys):
     files = small(tmp_path, "edges: [10 mm, 18 mm, 26 mm, 34 mm]\nradius: 1 mm\nlength: 120 mm\n")
-    largest, _ = working_range(*(getattr(synthetic_world(*files), name) for name in ("camera", "catheter")))
+    largest, _ = working_range(*(getattr(synthetic_world(*files), name) for name in ("camera", "catheter")), HALF)
     assert largest < 0.2
     given = {"camera": str(files[0]), "catheter": str(files[1])}
     out, _ = track(tmp_path / "run", "synthetic", frames=4, video=False, **given)
@@ -223,7 +223,7 @@ def test_short_bands_before_a_small_camera_come_nearer_and_are_found(tmp_path, c
     rows = truths(out / "synthetic")
     assert all(float(row["tip_z_m"]) < 1.1 * largest for row in rows)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Distance")]
-    assert f"about {0.75 * largest:.2g} m from the camera: three quarters of that range" in line
+    assert f"about {0.8 * largest:.2g} m from the camera: four fifths of the range in such colours" in line
 
 
 def test_bands_too_long_to_be_seen_within_the_range_stay_in_the_frame_and_say_so(tmp_path):
@@ -231,8 +231,10 @@ def test_bands_too_long_to_be_seen_within_the_range_stay_in_the_frame_and_say_so
     files = small(tmp_path, "edges: [10 mm, 90 mm, 170 mm, 250 mm]\nradius: 0.5 mm\nlength: 260 mm\n")
     world = synthetic_world(*files)
     distance = synthetic_distance(world)
-    assert working_range(world.camera, world.catheter)[0] < distance < 0.5
-    assert "its bands would leave the frame" in distance_text(world) and "beyond that range" in distance_text(world)
+    assert working_range(world.camera, world.catheter, HALF)[0] < distance < 0.5
+    assert "its bands would leave the frame" in distance_text(world) and "beyond the range in such" in distance_text(
+        world
+    )
 
     def inside(distance):
         poses = synthetic_poses(world, 45, distance)
