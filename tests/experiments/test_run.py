@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from holotorch.experiments.execute import check, execute
 from holotorch.experiments.pec import run as run_module
 from holotorch.experiments.pec.experiment import PECExperiment, build
 from holotorch.experiments.pec.plan import plan_text, plan_values
+from holotorch.experiments.pec.report import pec_outcome
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs.folder import claim
 from holotorch.experiments.runs.saving import Checkpoint
@@ -152,6 +154,18 @@ def test_one_black_colour_stays_dark_and_does_not_disturb_the_others(tmp_path):
     assert np.load(tmp_path / "a" / "arrays" / "phase.npy")[0, 2].max() == 0
     assert numbers["ssim_mean"] == pytest.approx(np.mean(numbers["ssim"][:2]))
     assert any("colour 2 of the picture is black" in note for note in read(tmp_path / "a", "plan.json")["notes"])
+
+
+def test_a_plan_says_at_which_distance_the_array_resolves_its_samples():
+    far = check(settings("pec/fresnel.yaml", "propagator.distance=0.4")).text
+    (near,) = re.findall(r"\(propagator\.distance=(.*)mm\)", far)
+    assert "propagator.distance=" not in check(settings("pec/fresnel.yaml", f"propagator.distance={near}mm")).text
+
+
+@pytest.mark.parametrize(("frames", "ssim", "advised"), [(1, 0.7, True), (4, 0.7, False), (1, 0.9, False)])
+def test_several_frames_are_advised_where_one_is_poor(frames, ssim, advised):
+    corrected = {"ssim_mean": ssim, "frames": frames, "peak_temperature_rise_K": [300.0]}
+    assert ("frames=4" in "".join(pec_outcome({"methods": {"corrected": corrected}}))) == advised
 
 
 class StopAfter:

@@ -248,7 +248,8 @@ def _notes(experiment: PECExperiment) -> list[str]:
             nearer = farthest * max(grid.pitch) / spot
             notes.append(
                 f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "
-                f"detail of the picture cannot be formed; a sample is resolved up to {nearer * 1e3:.3g} mm"
+                f"detail of the picture cannot be formed; a sample is resolved up to {nearer * 1e3:.3g} mm "
+                f"(propagator.distance={nearer * 1e3:.3g}mm)"
             )
     elif len(experiment.wavelengths) > 1:
         notes.append(

@@ -19,6 +19,7 @@ METHOD_NAMES = {
 }
 ISOLATED_NAME = "Corrected, on a chip that stands alone"
 _PICTURES = {"target": "Target", **METHOD_NAMES, "isolated": ISOLATED_NAME}
+_POOR = 0.8  # SSIM of a corrected picture below which more frames are advised
 _FIGURES = {
     "phase": "Heater phases, before the heat spreads{frame}",
     "temperature": "Temperature of the chip above ambient, after the heat has spread{frame}",
@@ -42,7 +43,10 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
         scores.append(f"SSIM {_fixed(between, 3)} midway between the samples, which a viewer sees as well")
     scores.append(f"hottest pixel {max(corrected['peak_temperature_rise_K']):.0f} degC above ambient")
     noise = [f"Kernel     {_with_noise(numbers)}"] if (numbers := corrected.get("kernel_noise")) else []
-    return [f"Result     {', '.join(scores)}", *noise, *error_line(summary)]
+    advice = []
+    if corrected.get("frames") == 1 and corrected.get("ssim_mean", 1.0) < _POOR:
+        advice.append("Note       several frames in turn, whose mean is seen, come closer to the picture: frames=4")
+    return [f"Result     {', '.join(scores)}", *noise, *advice, *error_line(summary)]
 
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:

@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -33,6 +34,7 @@ _NUMBERS = COLUMNS[5:19]  # tip, direction, covariance of the tip, chi-square an
 _COLUMNS = ("time_s", "status", "reason", *_NUMBERS)
 
 Show = Callable[[str], None]  # prints a line
+_at_once = partial(print, flush=True)  # into a pipe too: what waits for a browser must be read before one opens
 TimedPose = tuple[float, Pose]  # capture time in seconds, and pose
 
 
@@ -155,7 +157,7 @@ def stream(
     repeat: bool = False,
     smooth: bool = False,
     track: Callable[[Sequence[str]], Iterable[TimedPose]] | None = None,
-    show: Show = print,
+    show: Show = _at_once,
 ) -> Streamed:
     """Send poses until the sources end or the user interrupts the stream.
 
@@ -293,7 +295,7 @@ async def _send(
                 show(f"Receiver   {link.host}:{link.port}: {link.sent} sent, {link.dropped} dropped for newer{text}")
 
 
-def view(port: int = PORT, *, seconds: float = math.inf, show: Show = print) -> None:
+def view(port: int = PORT, *, seconds: float = math.inf, show: Show = _at_once) -> None:
     """Print the newest packet at ``port`` once a second, and finally statistics. ConfigError if the port is in use."""
     receiver = PoseReceiver(port)
 

@@ -176,9 +176,10 @@ def preset_note(experiment: VolumeExperiment) -> str:
 def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     notes = list(dict.fromkeys(note for plan in experiment.plans for note in plan.notes))
     if slab_error > _COARSE_SLABS:
+        twice = 2 * len(experiment.depths) * experiment.settings.scale
         notes.append(
-            f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: more planes "
-            "(hologram.depths) come closer, at little cost with axial nodes"
+            f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: more planes, such as "
+            f"hologram.depths={twice}, come closer, at little cost with axial nodes"
         )
     if words := preset_note(experiment):
         notes.append(words)

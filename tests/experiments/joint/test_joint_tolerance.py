@@ -32,6 +32,15 @@ def test_without_a_tolerance_nothing_changes():
     assert len(plan.values["foci_mm"]) == 5 and plan.values["stop_below"] == 0 and "L-BFGS, 60 steps" in plan.text
     assert plan.values["taps"] == 5 and plan.values["precision"] == "complex64"
     assert list(parts(plan.values)) == ["heat", "planes", "propagation"] and "by default" in plan.text
+    assert "off this volume" not in plan.text
+
+
+def test_planes_that_are_slices_of_a_volume_rather_than_the_volume_are_noted():
+    plan = check(settings("display.planes=2"))
+    error = parts(plan.values)["planes"]["predicted_error"]
+    assert error > 0.5
+    (note,) = [line for line in plan.text.splitlines() if "off this volume" in line]
+    assert f"2 planes are {error:.0%} off" in note and "such as display.planes=4, come closer" in note
 
 
 def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():
