@@ -222,7 +222,7 @@ def _parser() -> argparse.ArgumentParser:
     config.add_argument("config", metavar="CONFIG", help="YAML file, such as configs/pec/fourier.yaml")
     config.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, such as grid.pitch=8um")
 
-    demo = command("demo", _demo, "a small real run of each system on bundled data, under a minute")
+    demo = command("demo", _demo, "a small real run of each system on bundled data, in a minute or two")
     demo.add_argument("--out", type=Path, help="folder of the run (default: runs/demo-001, ...)")
 
     about = "one experiment: pictures, numbers and a report in a folder of its own"

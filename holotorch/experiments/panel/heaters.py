@@ -29,7 +29,7 @@ from holotorch.modulator import PhasedArray
 _MEANINGS = {
     "heater": (
         "rad",
-        "phase that the heater of each pixel alone causes, before the heat spreads: what to drive it with",
+        "phase that each heater alone causes at its own pixel, before the heat spreads: what to drive it with",
     ),
     "temperature": ("K", "temperature of each pixel above ambient, after the heat has spread"),
     "optical": ("rad", "phase of the light of each pixel, after the heat has spread, not modulo 2 pi"),
@@ -125,11 +125,11 @@ def heaters_text(report: dict[str, Any]) -> str:
             "rad; use more bits, or compute the run for them (modulator.bits of kind pec)"
         )
     return (
-        f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s): heater_*: phases that the heaters "
-        f"alone cause, in rad before the heat spreads (a step of the PNG is {step:.4g} rad, {report['heater_bits']} "
-        f"bits); temperature_*: K above ambient, at most {report['peak_temperature_K']:.0f}; optical_*: phases of the "
-        "light in rad after spreading, not modulo 2 pi. A liquid-crystal panel needs holotorch export-slm instead"
-        + warning
+        f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s): heater_*: phases in rad that each "
+        f"heater alone causes at its own pixel, before the heat spreads (a step of the PNG is {step:.4g} rad, "
+        f"{report['heater_bits']} bits); temperature_*: K above ambient, at most {report['peak_temperature_K']:.0f}; "
+        "optical_*: phases of the light in rad after spreading, not modulo 2 pi. A liquid-crystal panel needs "
+        "holotorch export-slm instead" + warning
     )
 
 

@@ -133,8 +133,8 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     lines += [
         f"Heat       {values['heat']}",
         f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
-        f"{values['start']['kind']} start ({values['start']['reason']}); it stops after {settings.solver.patience} "
-        f"changes of the loss below {values['stop_below']:.1e} of it",
+        f"{values['start']['kind']} start ({values['start']['reason']}); it stops when "
+        f"{settings.solver.patience} steps in a row change the loss by less than {100 * values['stop_below']:.2g} %",
         f"{experiment.budget.text}; {values['precision']}",
         f"Cost       at most about {values['predicted_evaluations']} evaluations, "
         f"{duration(values['predicted_seconds'])} ({seconds_in_words(values['seconds_of'])}), "

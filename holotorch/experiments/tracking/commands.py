@@ -32,14 +32,14 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
     about = "a camera's intrinsics from photographs, its place on a headset, or the colours of a catheter's bands"
     calibrate = commands.add_parser("calibrate", help=about)
-    what = "photographs of a board, or folders of them; or: headset ALIGNMENTS.csv; or: catheter PHOTOGRAPH"
+    what = "photographs of a board, or folders of them; or: headset ALIGNMENTS.csv; or: catheter PHOTOGRAPH_OR_VIDEO"
     calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help=what)
     board = "chessboard 9x6 25mm (default; inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250"
     calibrate.add_argument("--board", nargs="+", metavar="WORD", help=board)
     # Without this pattern, argparse would read -25mm as an option instead of an (invalid) length.
     calibrate._negative_number_matcher = re.compile(r"-\.?\d")
     calibrate.add_argument("--axes", help="of the headset's frame: RDF (default), RUB (WebXR), RUF (Unity), ...")
-    about = "of a catheter: where each band is on the photograph, from the tip on, in pixels, as X,Y or X0,Y0,X1,Y1"
+    about = "of a catheter: where each band is on the photograph, from the tip on, in pixels: X,Y or X0,Y0,X1,Y1"
     calibrate.add_argument("--bands", nargs="+", metavar="PLACE", help=about)
     about = "of a catheter: YAML file whose edges, radius and length are kept (default: configs/tracking/catheter.yaml)"
     calibrate.add_argument("--catheter", type=Path, metavar="FILE", help=about)

@@ -19,8 +19,9 @@ class TrackSettings(Settings):
     """Tracking of a catheter in a video, a folder of pictures, a recording, or the frames of a live camera.
 
     ``source``: a path, the index of a camera, or ``synthetic``. A synthetic run first renders a recording of
-    ``frames`` frames with true poses. ``camera``, ``catheter``: YAML files; by default, those beside the recording,
-    or a synthetic camera and the dissertation's catheter if ``source`` is ``synthetic``. ``headset``: YAML file of the
+    ``frames`` frames with true poses. ``camera``: YAML file of its intrinsics, as ``holotorch calibrate`` writes it; by
+    default, that beside the recording, or a synthetic camera if ``source`` is ``synthetic``. ``catheter``: YAML file of
+    its bands; by default, that beside the recording, or the dissertation's catheter. ``headset``: YAML file of the
     camera's place on a headset; poses are also written in its frame. ``record``: save every frame without loss for a
     later run. ``video``: write a video with the pose drawn on every frame; of a synthetic recording also one without.
     ``still``: measure the tip's stability; the catheter must rest. ``rate_hz``: frames per second without time stamps.

@@ -19,7 +19,7 @@ def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
     values = values[:: max(1, len(values) // _SAMPLE)].double().cpu()
     lowest, chosen, of = values.min(), values, ""
     if 0.5 < (share := (values == lowest).double().mean().item()) < 1:  # air, which would hide all that is in it
-        chosen, of = values[values > lowest], f" of the {100 * (1 - share):.2g} % above the smallest"
+        chosen, of = values[values > lowest], f" (of the {100 * (1 - share):.2g} % of voxels above the smallest value)"
     levels = np.percentile(chosen.numpy(), _SHARES)
     with torch.no_grad():
         visible = (experiment.transfer(values.to(experiment.device))[1] > 0).double().mean().item()
@@ -27,8 +27,8 @@ def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
     bright = picture.amax().item()
     picture = in_colour(picture, experiment.settings.wavelengths)
     lines = [
-        f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of} "
-        + ", ".join(f"{share:g} %: {level:.6g}" for share, level in zip(_SHARES, levels, strict=True)),
+        f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of}: "
+        + ", ".join(f"{level:.6g} at {share:g} %" for share, level in zip(_SHARES, levels, strict=True)),
         f"Visible    {100 * visible:.2g} % of the voxels have an opacity above 0"
         + ("" if bright > 0.02 else "; the rendering is black: move the transfer function to the values of the volume"),
     ]

@@ -214,7 +214,8 @@ def test_the_usual_camera_and_catheter_stay_where_they_were():
 
 def test_short_bands_before_a_small_camera_come_nearer_and_are_found(tmp_path, capsys):
     files = small(tmp_path, "edges: [10 mm, 18 mm, 26 mm, 34 mm]\nradius: 1 mm\nlength: 120 mm\n")
-    largest, _ = working_range(*(getattr(synthetic_world(*files), name) for name in ("camera", "catheter")), HALF)
+    world = synthetic_world(*files)
+    largest, _ = working_range(world.camera, world.catheter, HALF)
     assert largest < 0.2
     given = {"camera": str(files[0]), "catheter": str(files[1])}
     out, _ = track(tmp_path / "run", "synthetic", frames=4, video=False, **given)

@@ -69,7 +69,7 @@ def test_a_preview_shows_the_volume_and_its_values(scan, tmp_path, capsys):
     assert main(["check", *words, "--preview", str(picture)]) == 0
     out = capsys.readouterr().out
     # 904 of 8000 voxels lie in the ball.
-    assert "Values     20 to 255; percentiles 1 %: 20" in out and "99 %: 20" in out and "Visible    11 %" in out
+    assert "Values     20 to 255; percentiles: 20 at 1 %, 20 at 25 %" in out and "202 at 99 %" in out and "Visible    11 %" in out
     pixels = load_image(picture).movedim(0, -1).numpy() * 255
     left = pixels[:, : pixels.shape[1] // 3]
     black = (left.sum(-1) < 30).mean()
@@ -109,7 +109,8 @@ def test_the_percentiles_of_a_scan_that_is_mostly_empty_are_those_of_what_is_in_
     assert main(["check", *words, "--preview", str(tmp_path / "look.png")]) == 0
     out = capsys.readouterr().out
     assert (
-        "Values     0 to 163; percentiles of the 0.8 % above the smallest 1 %: 100.63" in out and "50 %: 131.5" in out
+        "Values     0 to 163; percentiles (of the 0.8 % of voxels above the smallest value): 100.63" in out
+        and "131.5 at 50 %" in out
     )
 
 

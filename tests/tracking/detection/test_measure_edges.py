@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 from oracles.strips import on_plane
+from scipy.special import ndtr
 from tracked import NEAR, SIZE, WORLD, at
 
 from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.detection.bands import Stretches
-from holotorch.tracking.detection.fits import EdgeFit
+from holotorch.tracking.detection.fits import EdgeFit, fit_edges
 from holotorch.tracking.detection.footprint import bulge_px
-from holotorch.tracking.detection.measure import Edges, _across, measure_edges
+from holotorch.tracking.detection.measure import Edges, _across, _without_background, measure_edges
 from holotorch.tracking.detection.stations import Axis, look_across, measure_axis
 from holotorch.tracking.pose.catheter import THESIS
 from holotorch.tracking.pose.resection import LinePose
@@ -198,3 +199,33 @@ def test_changes_that_noise_may_make_are_none():
     steps = [[0.1, 0.1]] * 3
     assert not _across(beside(steps, 0.3), along, fit_of(0.2))[0].any()
     assert _across(beside(steps, 0.01), along, fit_of(0.2))[0].all()
+
+
+@pytest.mark.parametrize("stripe", [3.0, 8.0, 21.0])
+def test_a_striped_background_that_leaks_into_the_rows_leaves_the_edge_where_it_is(stripe):
+    """Stripes beside a tube of five rows, 2 to 30 % of whose light the blur mixes into them."""
+    rng, t, u = np.random.default_rng(4), np.arange(-20, 21.0), np.arange(-2, 3.0)
+    behind = (np.sin(2 * math.pi * (t[:, None] + np.array([0.0, 0.4 * stripe])) / stripe) > 0)[None, ..., None] * 0.5
+    behind = behind + 0.1 + np.zeros((1, 1, 1, 3))  # [E, T, 2, C]
+    share = np.stack([0.3 * np.exp(-(u + 2)), 0.3 * np.exp(u - 2)], -1)  # of each row and side
+    step, noise = np.array([0.2, -0.1, 0.05]), 0.004
+    light = 0.3 + step * ndtr((t - 0.3) / 0.9)[None, :, None, None] + np.zeros((1, 1, 5, 1))
+    light = light + np.einsum("us,etsc->etuc", share, behind) + noise * rng.standard_normal(light.shape)
+    weight = np.full(light.shape, noise**-2)
+    before = fit_edges(light, weight, t=t)
+    after = fit_edges(_without_background(light, weight, before, t, behind), weight, t=t)
+    assert abs(after.place[0] - 0.3) < 4 * after.deviation[0] < 0.2
+    assert (
+        before.noise[0] > 3 * after.noise[0] and after.noise[0] < 1.3 and after.deviation[0] < before.deviation[0] / 3
+    )
+
+
+def test_a_background_that_is_even_or_changes_only_at_the_edge_is_not_subtracted():
+    t, noise = np.arange(-20, 21.0), 0.004
+    rise = ndtr(t / 0.9)[None, :, None, None]
+    light = 0.3 + 0.2 * rise + noise * np.random.default_rng(1).standard_normal((1, len(t), 5, 3))
+    weight = np.full(light.shape, noise**-2)
+    fit = fit_edges(light, weight, t=t)
+    for behind in (np.full((1, len(t), 2, 3), 0.4), 0.4 + 0.3 * rise + np.zeros((1, 1, 2, 3))):
+        again = fit_edges(_without_background(light, weight, fit, t, behind), weight, t=t)
+        assert again.place[0] == pytest.approx(fit.place[0], abs=0.3 * fit.deviation[0])
