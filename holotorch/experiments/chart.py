@@ -19,7 +19,8 @@ class Subject:
 
     ``module`` has a function of the subject's name. ``table`` is the name of its second table; functions that return
     several further tables return them by name instead. ``minutes`` of one CPU core and ``gigabytes`` (1e9 bytes, of the
-    largest process, at the peak) were measured as by ``python scripts/predictions.py --charts``; None: not measured.
+    largest process, at the peak) were measured as by ``python scripts/predictions.py --charts``, those of ``chain``
+    by its own table ``cost``; None: not measured.
     """
 
     module: str
@@ -30,9 +31,9 @@ class Subject:
     @property
     def cost(self) -> str:
         """Time and memory of the full form in words, and whether the memory is not free."""
-        if self.minutes is None:
-            return "what it takes has not been measured; many minutes, perhaps hours"
-        cost = f"about {duration(60 * self.minutes)} of a CPU core"
+        cost = (
+            f"about {duration(60 * self.minutes)} of a CPU core" if self.minutes else "minutes or hours (not measured)"
+        )
         if self.gigabytes is None:
             return f"{cost}; its memory has not been measured"
         free = available_memory()
@@ -46,14 +47,14 @@ CHARTS = {
     "stability": Subject("holotorch.experiments.stability.chart", minutes=1.9, gigabytes=0.84),
     "volume": Subject("holotorch.experiments.volume.chart", "scaling"),
     "eye": Subject("holotorch.experiments.eye.chart", "tradeoff", minutes=7.6, gigabytes=8.3),
-    "retina": Subject("holotorch.experiments.eye.retina_chart"),
+    "retina": Subject("holotorch.experiments.eye.retina_chart", minutes=19, gigabytes=12.2),
     "scaling": Subject("holotorch.experiments.scaling.chart", minutes=1.7, gigabytes=0.83),
     "devices": Subject("holotorch.experiments.devices.chart", minutes=6.2, gigabytes=5.8),
     "camera": Subject("holotorch.experiments.camera.chart", "corrected", minutes=9.7, gigabytes=0.73),
     "pec": Subject("holotorch.experiments.pec_study.chart", "comparison"),
     "network": Subject("holotorch.experiments.network.chart", "training"),
     "joint": Subject("holotorch.experiments.joint.charts.chart"),
-    "chain": Subject("holotorch.experiments.joint.charts.chain"),
+    "chain": Subject("holotorch.experiments.joint.charts.chain", gigabytes=4.8),
     "tracking": Subject("holotorch.experiments.tracking_benchmark.chart", "grids", minutes=90),
 }
 QUICK_FORM = "Quick form: smaller and fewer cases, no goal is tested"  # how the verdict of a quick chart begins

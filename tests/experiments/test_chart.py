@@ -133,7 +133,10 @@ def test_a_full_chart_says_first_what_it_takes(tmp_path, stand_ins, monkeypatch,
         assert capsys.readouterr().err == f"only: about 90 min of a CPU core and 2.2 GB of memory{little}\n"
     monkeypatch.setitem(charts.CHARTS, "only", Subject("a module"))
     charts.chart("only", tmp_path)
-    assert capsys.readouterr().err.startswith("only: what it takes has not been measured")
+    assert capsys.readouterr().err == "only: minutes or hours (not measured); its memory has not been measured\n"
+    monkeypatch.setitem(charts.CHARTS, "only", Subject("a module", gigabytes=2.25))
+    charts.chart("only", tmp_path)
+    assert capsys.readouterr().err == "only: minutes or hours (not measured) and 2.2 GB of memory\n"
     charts.chart("only", tmp_path, quick=True)
     assert capsys.readouterr().err == ""
 

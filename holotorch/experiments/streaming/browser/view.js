@@ -77,7 +77,7 @@ function words() {
   const tip = pose && pose.answered ? scaled(pose.tip, 1e3).map((v) => v.toFixed(1)).join(", ") : "-";
   const panel = pictures.pictures.panel && state.panel ? `\npanel: capture to frame ${ms(pictures.pictures.panel.latency)}` : "";
   byId("numbers").textContent =
-    `tip ${tip} mm in ${state.setup ? state.setup.frame : "-"}\n` +
+    `tip ${tip} mm in the axes of the ${state.setup ? state.setup.frame.replace("_from_tool", "") : "-"}\n` +
     `capture to frame ${ms(state.latency)}, ${state.rate.toFixed(0)} frames/s, ${state.received} poses, ${state.lost} lost${panel}` +
     (camera() && state.setup.empty ? `\n${state.setup.empty}` : "");
   byId("alignment").textContent = aligning.alignmentText();
