@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from holotorch.experiments.config.errors import ConfigError, short
+from holotorch.experiments.config.inputs import with_its_files
 from holotorch.experiments.config.messages import nearest, validated
 from holotorch.experiments.config.source import Source, override, read_source
 from holotorch.experiments.config.version import upgraded
@@ -55,7 +56,7 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     ``path`` is a file, or the name of a configuration that comes with holotorch, such as "configs/demo.yaml".
     ConfigError with all mistakes, one line each with file, line and column.
     """
-    source = upgraded(read_source(find_config(path) or Path(path), overrides or []))
+    source = with_its_files(upgraded(read_source(find_config(path) or Path(path), overrides or [])))
     name = source.data.get("experiment")
     if not isinstance(name, str) or name not in KINDS:
         got = (

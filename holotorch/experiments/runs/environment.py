@@ -32,6 +32,7 @@ def environment(seed: int, device: torch.device) -> dict[str, Any]:
         "seed": seed,
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": ["holotorch", *sys.argv[1:]],
+        "folder": os.getcwd(),  # to which relative paths in config.yaml refer
     }
 
 

@@ -14,6 +14,7 @@ import yaml
 from pydantic import BaseModel
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.inputs import started_in, with_its_files
 from holotorch.experiments.config.messages import validated
 from holotorch.experiments.config.source import read_source
 from holotorch.experiments.config.version import FIRST_LINE, upgraded
@@ -91,7 +92,10 @@ def open_run(
             stack.enter_context(_locked(folder))
         with _keep_results(folder, new, resumes):
             (folder / "images").mkdir(exist_ok=True)
-            write_json(folder / "env.json", environment(getattr(settings, "seed", 0), torch.device(device)))
+            contents = environment(getattr(settings, "seed", 0), torch.device(device))
+            if not new and (start := started_in(folder)) is not None:
+                contents["folder"] = str(start)
+            write_json(folder / "env.json", contents)
             if new:
                 text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
                 write_text(folder / "config.yaml", FIRST_LINE + text)
@@ -113,7 +117,7 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
     if "summary.json" in files or not files >= {"env.json", "config.yaml"}:
         return False
     try:
-        previous = validated(upgraded(read_source(folder / "config.yaml", [])), type(settings))
+        previous = validated(with_its_files(upgraded(read_source(folder / "config.yaml", []))), type(settings))
     except ConfigError:
         return False
     if changed := differences(fingerprint(previous, {}), fingerprint(settings, {})):
