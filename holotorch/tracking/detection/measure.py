@@ -5,6 +5,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.special import ndtr
@@ -223,20 +224,15 @@ def measure_edges(
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
         coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
         shading, looks = fit, looks - 1
-        core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
+        closer = partial(_refitted, weight=weight, blur=blur, along=along, u=u, widths=widths)
         if coarse:
-            fit, shading = fit_luma(fit, light, shown, sampler.light, along)
-        elif not _astray(fit, looks):
-            fit = shading = _refitted(fit, light, weight, blur, along, core)
+            closer = partial(fit_luma, shown=shown, curve=sampler.light, t=along)
+        if coarse or not _astray(fit, looks):
+            fit, shading = closer(fit, light)
         if _unsure(fit) and not _astray(fit, looks):
-            sides = _SIGNS[::3] * (widths[:, None, None] / 2 + _WINDOW.leak)
-            behind = sampler.sharp(lens.distort(line.plane(near[:, None, None] + along[:, None], sides)))
-            light = _without_background(light, weight, fit, along, behind.transpose(1, 2, 3, 0))
-            other = fit_edges(light, weight, blur, t=along)
-            if coarse:
-                other, other_shading = fit_luma(other, light, shown, sampler.light, along)
-            else:
-                other = other_shading = _refitted(other, light, weight, blur, along, core)
+            sides = lens.distort(line.plane((near[:, None] + along)[..., None], _leaking(widths)))
+            light = _without_background(light, weight, fit, along, sampler.sharp(sides).transpose(1, 2, 3, 0))
+            other, other_shading = closer(fit_edges(light, weight, blur, t=along), light)
             fit, shading = fit.or_better(other), shading.or_better(other_shading)
         near = near + fit.place
         if not _astray(fit, looks):
@@ -244,10 +240,7 @@ def measure_edges(
     near = near - bulge * front.shift(shading.steps, shading.told, row)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6))).reshape(*every.shape[:2], 6, 3)
     texture = np.zeros(len(guess))
-    covered, beyond, texture[chosen] = _across(beside, along - fit.place[:, None], fit)
-    if beyond and len(near) > 2 and median(fit.blur) < blur + BLURRED:
-        text = "all bands continue beside the tube: the object is thicker than the catheter"
-        raise Refusal(Status.INCONSISTENT, text, final=True)
+    covered, texture[chosen] = _covered(beside, along - fit.place[:, None], fit, blur)
     within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
     clear = (fit.deviation < _LIMITS.vague) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
     hidden, outside, absent = list[int](), list[int](), list[int]()
@@ -296,19 +289,26 @@ def _without_background(
 
 
 def _refitted(
-    fit: EdgeFit, light: np.ndarray, weight: np.ndarray, blur: float, along: np.ndarray, core: np.ndarray
-) -> EdgeFit:
-    """For each edge the best of the ``fit``, and if some are unsure of fits to the middle rows and near the edge.
+    fit: EdgeFit,
+    light: np.ndarray,
+    weight: np.ndarray,
+    blur: float,
+    along: np.ndarray,
+    u: np.ndarray,
+    widths: np.ndarray,
+) -> tuple[EdgeFit, EdgeFit]:
+    """For each edge the best of the ``fit`` and, if some are unsure, of fits to the middle rows and near it; twice.
 
-    Arguments as for :func:`fit_edges`; ``core`` [E, U] are the weights of the middle rows.
+    Arguments as for :func:`fit_edges`; ``u`` [U] are the positions of the rows across tubes of ``widths`` [E].
     """
     if _unsure(fit):  # light of an uneven background leaks into the outer rows
+        core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
         fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
     if _unsure(fit):
         # A stain or a shadow on the tube is a second edge in the window of an edge beside it.
         close = (np.abs(along) <= _WINDOW.close + 2 * blur)[:, None, None]
         fit = fit.or_better(fit_edges(light, weight * close, blur, t=along))
-    return fit
+    return fit, fit
 
 
 def _unsure(fit: EdgeFit) -> bool:
@@ -393,6 +393,20 @@ def _astray(fit: EdgeFit, looks: int) -> bool:
 def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
     """Positions [E, 6] across tubes of ``widths`` [E], of three rows beyond either blurred side."""
     return _SIGNS * (_ROWS + 2 * blur + widths[:, None] / 2)
+
+
+def _leaking(widths: np.ndarray) -> np.ndarray:
+    """Positions [E, 1, 2] across tubes of ``widths`` [E] at which the background is read that leaks into their rows."""
+    return np.array([-1.0, 1.0]) * (widths[:, None, None] / 2 + _WINDOW.leak)
+
+
+def _covered(light: np.ndarray, along: np.ndarray, fit: EdgeFit, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """First and last result of :func:`_across`; a Refusal if all edges continue beside the tube, sharp as ``blur``."""
+    covered, beyond, texture = _across(light, along, fit)
+    if beyond and len(light) > 2 and median(fit.blur) < blur + BLURRED:
+        text = "all bands continue beside the tube: the object is thicker than the catheter"
+        raise Refusal(Status.INCONSISTENT, text, final=True)
+    return covered, texture
 
 
 def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool, np.ndarray]:
