@@ -104,6 +104,11 @@ def warnings(values: dict[str, Any]) -> list[str]:
             f"(view.width of its configuration): {100 * least:.2g} % of the light of the edge enters the pupil, and "
             f"below {100 * _INVISIBLE:g} % it counts as invisible"
         )
+    elif min(values["eye_box_mm"]) <= 0:
+        lines.append(
+            "no position of the pupil shows the whole scene at its full brightness (an eye box of 0 mm): its edge gets "
+            "darker; narrow the scene (view.width of its configuration) or enlarge eye.pupil_radius"
+        )
     if (least := min(values["light_in_pupil"])) < _LITTLE:
         lines.append(
             f"only {100 * least:.2g} % of the light of the scene's centre enters the pupil: pictures are dim (below "

@@ -12,6 +12,7 @@ from holotorch.experiments.planning.correction import HEAT, PROPAGATION, STOPPIN
 from holotorch.experiments.planning.tolerance import Budget, Part
 from holotorch.modulator import ThermalCrosstalk
 
+COARSE_PLANES = 0.5  # error of representing a volume by planes above which a run notes it
 SLABS = "planes"  # part with the error of representing slabs of the volume by planes
 PATIENCE = 10  # small changes of the loss in a row after which the solver stops, with a tolerance
 _COUNTS = (5, 8, 12, 16, 24, 32, 48, 64)  # numbers of planes to choose from

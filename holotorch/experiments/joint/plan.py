@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from holotorch.experiments.joint.budget import PATIENCE, SLABS, stop
+from holotorch.experiments.joint.budget import COARSE_PLANES, PATIENCE, SLABS, stop
 from holotorch.experiments.joint.config import REFERENCE, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
@@ -17,7 +17,6 @@ from holotorch.optics.light.coherence import depth_of_focus
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
 _KERNEL_BYTES = 8  # bytes per padded sample of a view of a colour, of the transfer functions of all views
 _BASE_BYTES = 430e6  # memory of the libraries
-_COARSE_PLANES = 0.5  # error of representing the volume by planes above which the plan contains a note
 _SPACING = 0.75  # of planes, in depths of focus, above which foci between them are worse (10 dB at 0.94)
 
 
@@ -104,7 +103,7 @@ def _left(settings: JointSettings) -> float:
 def _notes(experiment: JointExperiment) -> list[str]:
     settings, foci = experiment.settings, experiment.foci
     notes = dark_picture(experiment.scene)
-    if (error := experiment.budget.error(SLABS)) > _COARSE_PLANES:
+    if (error := experiment.budget.error(SLABS)) > COARSE_PLANES:
         notes.append(
             f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show "
             f"slices of it; more planes, such as display.planes={2 * len(foci)}, come closer"

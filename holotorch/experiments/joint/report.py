@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+from holotorch.experiments.joint.budget import COARSE_PLANES
 from holotorch.experiments.joint.names import NAMES, SETS
 from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
@@ -30,7 +31,10 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
     if others:
         best = max(others, key=others.__getitem__)
         scores.append(f"the best other method, {NAMES[best]}: {others[best]:.1f} dB at the corrected foci")
-    return [f"Result     PSNR {'; '.join(scores)}", *error_line(summary)]
+    error, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), []
+    if error > COARSE_PLANES:
+        notes.append(f"Note       the planes are {error:.0%} off the volume: more of them (display.planes) come closer")
+    return [f"Result     PSNR {'; '.join(scores)}", *notes, *error_line(summary)]
 
 
 def joint_section(record: RunRecord) -> list[str]:

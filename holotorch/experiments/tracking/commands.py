@@ -39,7 +39,10 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     # Without this pattern, argparse would read -25mm as an option instead of an (invalid) length.
     calibrate._negative_number_matcher = re.compile(r"-\.?\d")
     calibrate.add_argument("--axes", help="of the headset's frame: RDF (default), RUB (WebXR), RUF (Unity), ...")
-    about = "of a catheter: where each band is on the photograph, from the tip on, in pixels: X,Y or X0,Y0,X1,Y1"
+    about = (
+        "of a catheter: where each band is on the photograph, from the tip on, in pixels: X,Y or X0,Y0,X1,Y1; without "
+        "it, the first frame of a video is saved as a picture"
+    )
     calibrate.add_argument("--bands", nargs="+", metavar="PLACE", help=about)
     about = "of a catheter: YAML file whose edges, radius and length are kept (default: configs/tracking/catheter.yaml)"
     calibrate.add_argument("--catheter", type=Path, metavar="FILE", help=about)
@@ -86,11 +89,16 @@ def _calibrate(options: argparse.Namespace) -> int:
     from holotorch.experiments.config.errors import ConfigError
 
     if options.files[0] == Path("catheter"):
-        if len(options.files) != 2 or not options.bands or options.board or options.axes:
+        from holotorch.experiments.tracking.photograph import calibrate_catheter, save_first_frame
+        from holotorch.io.video import PICTURES
+
+        alone = len(options.files) == 2 and not (options.board or options.axes)
+        if alone and not options.bands and options.files[1].suffix.lower() not in PICTURES:
+            print(save_first_frame(options.files[1], options.out or Path(f"{options.files[1].stem}-frame.png")))
+            return OK
+        if not alone or not options.bands:
             expected = "calibrate catheter: expected one photograph and --bands X,Y X,Y X,Y, without --board and --axes"
             raise ConfigError([expected])
-        from holotorch.experiments.tracking.photograph import calibrate_catheter
-
         out = options.out or Path("catheter.yaml")
         measured = {"edges": f"[{', '.join(options.edges)}]"} if options.edges else {}
         measured |= {key: value for key in ("radius", "length") if (value := getattr(options, key))}

@@ -12,7 +12,8 @@ import torch
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking.devices import build_catheter, load_catheter, save_catheter
 from holotorch.io.bundled import find_config
-from holotorch.io.images import load_image, with_channels
+from holotorch.io.files import write_bytes
+from holotorch.io.images import encode_png, load_image, with_channels
 from holotorch.io.video import PICTURES, open_frames
 from holotorch.tracking import Camera, Catheter
 from holotorch.tracking.detection.channels import ambiguities, ambiguity_text
@@ -99,6 +100,18 @@ def calibrate_catheter(
     if doubt := ambiguity_text(ambiguities(camera, catheter)):
         notes.append(doubt)
     return catheter, [*lines, *(f"Note       {note}" for note in notes)]
+
+
+def save_first_frame(video: Path, out: Path) -> str:
+    """Write the first frame of a video as a picture to ``out`` and say what to do with it. ConfigError if it cannot."""
+    pixels = _pixels(video)
+    if out.exists():
+        raise ConfigError([f"{out} exists already; choose another --out, or give --bands X,Y X,Y X,Y"])
+    write_bytes(out, encode_png(pixels / 255))
+    return (
+        f"Frame      {out}, {pixels.shape[-1]} x {pixels.shape[-2]} px: find a pixel X,Y of each band, from the tip on, "
+        "and give --bands X,Y X,Y X,Y"
+    )
 
 
 def _pixels(photograph: Path) -> torch.Tensor:

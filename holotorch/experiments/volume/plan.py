@@ -254,7 +254,7 @@ def dark_picture(experiment: VolumeExperiment) -> list[str]:
         ]
     return [
         f"{100 * (1 - share):.0f} % of the picture is black: SSIM, which compares black with black there, says little; "
-        f"look at holotorch check --preview, and change transfer or view.width (said above {1 - _DARK:.0%} black)"
+        f"look at holotorch check --preview, and change transfer or view.width"
     ]
 
 

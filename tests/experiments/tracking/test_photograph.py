@@ -148,6 +148,19 @@ def test_options_of_a_catheter_belong_to_it(capsys):
     assert "--radius and --length belong to: calibrate catheter PHOTOGRAPH" in capsys.readouterr().err
 
 
+def test_without_positions_the_first_frame_of_a_video_is_saved(capsys):
+    frames = np.random.default_rng(0).integers(0, 255, (2, 48, 64, 3), dtype=np.uint8)
+    Path("video").mkdir()
+    for i, frame in enumerate(frames):
+        cv2.imwrite(f"video/{i}.png", frame)
+    assert main(["calibrate", "catheter", "video"]) == 0
+    assert "video-frame.png, 64 x 48 px" in capsys.readouterr().out
+    assert np.array_equal(cv2.imread("video-frame.png"), frames[0])
+    assert main(["calibrate", "catheter", "video"]) == 2
+    assert "video-frame.png exists already" in capsys.readouterr().err
+    assert main(["calibrate", "catheter", "none.mp4"]) == 2 and "none.mp4" in capsys.readouterr().err
+
+
 TOOLS = {
     "thin": (0.038, 0.070, 0.6e-3, "the tube is narrower than 2.4 px"),
     "short bands": (0.006, 0.070, 1e-3, "the tip is less certain than 2 mm"),

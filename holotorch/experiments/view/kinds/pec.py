@@ -54,11 +54,13 @@ class PECViewer(Viewer):
         settings, distances = self._experiment.settings, self._experiment.distances
         pictures = {"intensity": "the picture", "heaters": "heater phases", "temperature": "temperature of the chip"}
         sigma = self._sigma
+        given = settings.modulator.sigma_px is not None
+        chip = f"{sigma:g} px" if given else f"a measured kernel, to which {sigma:.3g} px fit best"
         controls: list[Slider | Choice] = [
             Choice("picture", "Show", pictures, "intensity", "What the chip forms, its heaters, or how hot it gets."),
             Slider(
                 "sigma", "Spread of the heat (sigma)", "px", **span(0.0, min(2 * sigma + 1, SIGMA_PX.high), sigma),
-                explanation=f"How far heat reaches on the real chip; the phases were computed for {sigma:g} px.",
+                explanation=f"How far heat reaches on the real chip; the phases were computed for {chip}.",
             ),
         ]  # fmt: skip
         if distances:
