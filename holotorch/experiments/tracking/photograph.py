@@ -109,8 +109,8 @@ def save_first_frame(video: Path, out: Path) -> str:
         raise ConfigError([f"{out} exists already; choose another --out, or give --bands X,Y X,Y X,Y"])
     write_bytes(out, encode_png(pixels / 255))
     return (
-        f"Frame      {out}, {pixels.shape[-1]} x {pixels.shape[-2]} px: find a pixel X,Y of each band, from the tip on, "
-        "and give --bands X,Y X,Y X,Y"
+        f"Frame      {out}, {pixels.shape[-1]} x {pixels.shape[-2]} px: find a pixel X,Y of each band, from the tip "
+        "on, and give --bands X,Y X,Y X,Y"
     )
 
 
