@@ -55,7 +55,7 @@ CHARTS = {
     "network": Subject("holotorch.experiments.network.chart", "training"),
     "joint": Subject("holotorch.experiments.joint.charts.chart"),
     "chain": Subject("holotorch.experiments.joint.charts.chain", gigabytes=4.8),
-    "tracking": Subject("holotorch.experiments.tracking_benchmark.chart", "grids", minutes=90),
+    "tracking": Subject("holotorch.experiments.tracking_benchmark.chart", "grids", minutes=54, gigabytes=1.2),
 }
 QUICK_FORM = "Quick form: smaller and fewer cases, no goal is tested"  # how the verdict of a quick chart begins
 

@@ -155,7 +155,7 @@ def test_without_positions_the_first_frame_of_a_video_is_saved(capsys):
         cv2.imwrite(f"video/{i}.png", frame)
     assert main(["calibrate", "catheter", "video"]) == 0
     assert "video-frame.png, 64 x 48 px" in capsys.readouterr().out
-    assert np.array_equal(cv2.imread("video-frame.png"), frames[0])
+    assert np.array_equal(np.asarray(cv2.imread("video-frame.png")), frames[0])
     assert main(["calibrate", "catheter", "video"]) == 2
     assert "video-frame.png exists already" in capsys.readouterr().err
     assert main(["calibrate", "catheter", "none.mp4"]) == 2 and "none.mp4" in capsys.readouterr().err
