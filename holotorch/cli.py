@@ -100,10 +100,10 @@ def _check(options: argparse.Namespace) -> int:
     from holotorch.experiments.registry import load_config
 
     settings = load_config(options.config, options.overrides)
-    from holotorch.experiments.execute import check
+    from holotorch.experiments.execute import check, emphasised
 
     plan = check(settings)
-    print(plan.text)
+    print(emphasised(plan.text))
     if options.preview is not None:
         from holotorch.experiments.execute import write_preview
 

@@ -45,7 +45,7 @@ class Subject:
 CHARTS = {
     "propagation": Subject("holotorch.experiments.propagation.chart", "prediction", minutes=17.5, gigabytes=12.6),
     "stability": Subject("holotorch.experiments.stability.chart", minutes=1.9, gigabytes=0.84),
-    "volume": Subject("holotorch.experiments.volume.chart", "scaling"),
+    "volume": Subject("holotorch.experiments.volume.chart", "scaling", minutes=12.7, gigabytes=4.4),
     "eye": Subject("holotorch.experiments.eye.chart", "tradeoff", minutes=7.6, gigabytes=8.3),
     "retina": Subject("holotorch.experiments.eye.retina_chart", minutes=19, gigabytes=12.2),
     "scaling": Subject("holotorch.experiments.scaling.chart", minutes=1.7, gigabytes=0.83),

@@ -1,6 +1,7 @@
 """Implementation of the commands ``check``, ``run`` and ``resume`` for an experiment of any kind."""
 
 import os
+import re
 import sys
 import threading
 from collections.abc import Iterator
@@ -44,7 +45,7 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
             with interruptible() as signals:
                 return NO_FOLDER, kind.run(experiment, RunFolder(Path(), name, plan, signals))
         if kind.announces:
-            print(plan.text, flush=True)
+            print(emphasised(plan.text), flush=True)
         if plan.shortage:
             raise ConfigError([plan.shortage])
         kind.prepare(experiment)
@@ -60,6 +61,13 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
             return folder.path, kind.run(experiment, folder)
 
 
+def emphasised(text: str) -> str:
+    """The lines of a plan or result, those of notes and warnings in bold where they are printed on a terminal."""
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):  # see no-color.org
+        return text
+    return re.sub(r"^(Note|Warning|WARNING) .*", "\033[1m\\g<0>\033[0m", text, flags=re.MULTILINE)
+
+
 def print_outcome(folder: Path) -> None:
     """Print the main numbers of a run, and where its pictures and its report are; nothing for ``NO_FOLDER``.
 
@@ -68,7 +76,7 @@ def print_outcome(folder: Path) -> None:
     if folder == NO_FOLDER:
         return
     for line in outcome_lines(folder):
-        print(line)
+        print(emphasised(line))
     report = folder / "report.html"
     print(report if report.is_file() else folder)
 

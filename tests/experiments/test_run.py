@@ -18,6 +18,7 @@ from oracles import dense
 from paths import CONFIGS
 from skimage.metrics import structural_similarity
 
+from holotorch.cli import main
 from holotorch.correction import Solution
 from holotorch.experiments import execute as execute_module
 from holotorch.experiments.config.errors import ConfigError
@@ -160,6 +161,19 @@ def test_a_plan_says_at_which_distance_the_array_resolves_its_samples():
     far = check(settings("pec/fresnel.yaml", "propagator.distance=0.4")).text
     (near,) = re.findall(r"\(propagator\.distance=(.*)mm\)", far)
     assert "propagator.distance=" not in check(settings("pec/fresnel.yaml", f"propagator.distance={near}mm")).text
+
+
+def test_notes_of_a_plan_are_bold_on_a_terminal_alone(monkeypatch, capsys):
+    words = ["check", "configs/pec/fresnel.yaml", "propagator.distance=0.4"]
+    assert main(words) == 0
+    (note,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Note")]
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert main(words) == 0
+    bold = [line for line in capsys.readouterr().out.splitlines() if "\033" in line]
+    assert bold == [f"\033[1m{note}\033[0m"]
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert main(words) == 0 and "\033" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("frames", "ssim", "advised"), [(1, 0.7, True), (4, 0.7, False), (1, 0.9, False)])
