@@ -160,7 +160,10 @@ def _colour(pixels: torch.Tensor, box: tuple[int, int, int, int]) -> tuple[tuple
 
 
 def _like_band(pixels: torch.Tensor, x: int, y: int) -> np.ndarray:
-    """Pixels [3, n] around a position whose chroma is least that of the surroundings; all of them on a wide band."""
+    """Levels [3, n] of the pixels around a position whose chroma differs most from its surroundings.
+
+    On a band that is wider than the surroundings, where none differs much, these are all of the pixels.
+    """
 
     def square(radius: int) -> np.ndarray:
         rows, columns = slice(max(0, y - radius), y + radius + 1), slice(max(0, x - radius), x + radius + 1)

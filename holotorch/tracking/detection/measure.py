@@ -297,7 +297,7 @@ def _refitted(
     u: np.ndarray,
     widths: np.ndarray,
 ) -> tuple[EdgeFit, EdgeFit]:
-    """For each edge the best of the ``fit`` and, if some are unsure, of fits to the middle rows and near it; twice.
+    """The ``fit`` or, if some edges are unsure, for each the best of it and of fits to few rows or samples; twice.
 
     Arguments as for :func:`fit_edges`; ``u`` [U] are the positions of the rows across tubes of ``widths`` [E].
     """
