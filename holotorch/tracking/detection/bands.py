@@ -4,7 +4,7 @@ A label is c + 1 for the colour c of a band and 0 for any other colour (:class:`
 N the edges.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -131,10 +131,26 @@ def find_stretches(
 
 
 def order_scores(labels: np.ndarray, table: ColourTable) -> np.ndarray:
-    """Scores [K] in pixels of K lines of labels [K, T, R] in the better direction; 0 for a line without bands."""
+    """Scores [K] in pixels of K lines of labels [K, T, R] in the better direction; 0 for a line without bands.
+
+    A band counts for twice as much as the second best at most: a finger may be longer than all bands together, and next
+    to it a few pixels may have the colour of another band.
+    """
     sums = _worth(_shares(labels, table).swapaxes(0, 1), table.bands)
-    one, other = (_sweep(order)[0][:, -1] for order in (sums, _reversed(sums)))
-    return np.maximum(one, other) - sums[0, :, -1]
+    return np.maximum(_balanced(list(sums)), _balanced(_reversed(sums)))
+
+
+def _balanced(order: Sequence[np.ndarray]) -> np.ndarray:
+    """Scores [K] of lines whose cumulative scores [K, T + 1] as pixels of each part are in ``order``."""
+    _, cuts = _sweep(order)
+    lines, at = np.arange(len(order[0])), np.full(len(order[0]), order[0].shape[-1] - 1)
+    ends = []
+    for total, reached in reversed(cuts):
+        at = (total >= reached[lines, at, None]).argmax(-1)
+        ends.insert(0, at)
+    more = [band - order[0] for band in order[1:-1]]
+    worth = np.stack([own[lines, b] - own[lines, a] for own, a, b in zip(more, ends, ends[1:], strict=False)])
+    return np.minimum(worth, 2 * np.maximum(np.sort(worth, 0)[-2], 0)).sum(0)
 
 
 def _reversed(sums: np.ndarray) -> list[np.ndarray]:

@@ -28,6 +28,7 @@ _STRAIGHT = 0.95  # least cosine between the direction of parts and that from on
 _CANDIDATES = 16  # largest number of lines whose labels are read
 _EVERY = 2  # distance of these labels along a line, in coarse pixels
 _LINES = 3  # largest number of lines that are returned
+_SAME = 8.0  # distance of the ends of a line from another one up to which both are of one object, in pixels
 _ACROSS = 3.0  # distance from a line up to which parts belong to the line, in coarse pixels
 
 
@@ -41,6 +42,12 @@ class Segment:
 
     start: complex
     end: complex
+
+    def repeats(self, other: "Segment") -> bool:
+        """Whether both ends lie close to the line of the other one."""
+        gap = other.end - other.start
+        across = [((point - other.start) * gap.conjugate()).imag for point in (self.start, self.end)]
+        return max(map(abs, across)) < _SAME * abs(gap)
 
 
 def find_segments(frame: Tensor, table: ColourTable, *, thin: bool = False) -> list[Segment]:
@@ -237,10 +244,10 @@ def _ranked(
     found = labels.take(y * width + x, mode="clip") * inside
     drape = (found[..., 3:4] == found[..., 1:2]) & (found[..., 4:5] == found[..., 1:2])
     score = order_scores(found[..., :3] * ~drape, table)
-    order = np.argsort(-score, kind="stable")[:_LINES]
-    order = order[score[order] > 0]
     starts, ends = mean + low * along, mean + high * along
-    return [
-        Segment(start, end)
-        for start, end in zip((_STEP * starts[order]).tolist(), (_STEP * ends[order]).tolist(), strict=True)
-    ]
+    segments: list[Segment] = []
+    for k in np.argsort(-score, kind="stable").tolist():
+        new = Segment(_STEP * complex(starts[k]), _STEP * complex(ends[k]))
+        if score[k] > 0 and len(segments) < _LINES and not any(map(new.repeats, segments)):
+            segments.append(new)
+    return segments

@@ -31,6 +31,8 @@ class StripSearch:
     same_hue: float = math.cos(math.radians(12))  # least cosine between the chromas of two colours of the same hue
     pale: float = 1.05  # largest chroma of a clear tube over that of the background beside it
     beside: float = 14.0  # distance from the axis at which the background is read, in pixels; beside the widest tubes
+    averaged: int = 2  # pixels on either side of that distance whose mean is the background
+    alike: float = 14.0  # largest difference of equal colours in each channel, in levels; several times the noise
     halfway: int = 6  # samples on either side of a change of labels
     halfway_ends: int = 3  # outermost samples on either side that surely show one colour
 
@@ -110,12 +112,14 @@ def find_bands(
     reach: float,
     *,
     onward: bool,
+    thin: bool = False,
 ) -> tuple[Line, Stretches]:
     """Search a strip around ``line`` for the tube, and the line of the tube for its bands.
 
     The strip extends ``half`` pixels from t = 0 in both directions along the line, and ``aside`` pixels to both sides.
     ``reach`` is the largest slope of the tube relative to the line. ``onward`` states that t on the line is known to
-    rise from the tip to the rear.
+    rise from the tip to the rear. ``thin`` leaves out all pixels that do not differ from what is on both of their sides
+    in the strip, since surroundings may have the hue of a band.
 
     Returns:
         Line along the tube, on which t rises from the tip to the rear, and the bands on this line.
@@ -128,7 +132,10 @@ def find_bands(
     u = np.arange(-math.ceil(aside), aside + 1.0)
     every = min(6, max(2, end // (_SEARCH.columns if onward else _SEARCH.columns_cold)))
     some = t[end % every :: every]
-    found = find_axis(table.labels(sampler.nearest(line.pixels(lens, some, u))), some, u, reach)
+    labels = table.labels(sampler.nearest(line.pixels(lens, some, u)))
+    if thin:
+        labels *= _thin(sampler, lens, line, some, u)
+    found = find_axis(labels, some, u, reach)
     if found is None:
         raise Refusal(Status.NO_AXIS, "nothing thin and straight with the bands' colours")
     line = line.moved(*found)
@@ -156,6 +163,19 @@ def find_bands(
         turned = Line(line.origin, -line.along, line.scale)
         return turned, dataclasses.replace(stretches, edges=-stretches.edges, cuts=-stretches.cuts, flipped=False)
     return line, stretches
+
+
+def _thin(sampler: Sampler, lens: Lens, line: Line, t: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Whether the pixels [T, U] differ from the means of a few pixels at a distance on both sides of them."""
+    side = int(_SEARCH.beside)
+    wide = np.arange(u[0] - side - _SEARCH.averaged, u[-1] + side + _SEARCH.averaged + 1)
+    levels = sampler.nearest(line.pixels(lens, t, wide)).astype(np.float32)
+    sums = np.cumsum(np.pad(levels, ((0, 0), (1, 0), (0, 0))), 1)
+    width, count = 2 * _SEARCH.averaged + 1, len(u)
+    means = (sums[:, width:] - sums[:, :-width]) / width  # around u[0] - side to u[-1] + side
+    own = levels[:, side + _SEARCH.averaged :][:, :count]
+    gaps = [np.abs(own - mean).max(-1) for mean in (means[:, :count], means[:, 2 * side :])]
+    return np.minimum(*gaps) > _SEARCH.alike
 
 
 def halfway(sampler: Sampler, lens: Lens, line: Line, edges: np.ndarray) -> np.ndarray:

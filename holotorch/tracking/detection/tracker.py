@@ -2,10 +2,11 @@
 
 import cmath
 import dataclasses
+import itertools
 import math
 import time
 from collections.abc import Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 
 import numpy as np
@@ -22,7 +23,7 @@ from holotorch.tracking.detection.bands import Stretches
 from holotorch.tracking.detection.channels import ChannelOrder, as_levels, stated_order
 from holotorch.tracking.detection.coarse import find_segments
 from holotorch.tracking.detection.colours import ColourTable
-from holotorch.tracking.detection.completion import complete_edges
+from holotorch.tracking.detection.completion import complete_edges, lies_across
 from holotorch.tracking.detection.ends import shows_reversed
 from holotorch.tracking.detection.footprint import axis_on_plane, bulge_px, width_px
 from holotorch.tracking.detection.measure import BLURRED, Edges, find_bands, halfway, measure_edges
@@ -96,6 +97,7 @@ class SearchLimits:
 
 _FLOORS, _CHECK, _SEARCH = ErrorFloors(), WidthCheck(), SearchLimits()
 MOST_SD = 2e-3  # metres: deviation of a tip above which its pose is of no use
+_NEAR = 6.0  # pixels from an edge up to which something that lies across the tube disturbs its measurement
 _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
 _EXCHANGED = "exchanged red and blue channels can cause this; state the order of the channels (ChannelOrder)"
 
@@ -244,7 +246,7 @@ class CatheterTracker(nn.Module):
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = abs(segment.end - segment.start)
                 half = 0.5 * length + max(40.0, 0.7 * length)
-                line, stretches = self._shown(sampler, line, half, _SEARCH.aside, onward=False, least=1)
+                line, stretches = self._shown(sampler, line, half, _SEARCH.aside, onward=False, thin=thin, least=1)
                 return self._measured(sampler, line, stretches)
             except Refusal as refusal:
                 if refusal.final:
@@ -277,7 +279,15 @@ class CatheterTracker(nn.Module):
         return Line.between(self.lens, start, end), abs(end - start) * self.lens.scale / 2 + 1.5 * _SEARCH.motion
 
     def _shown(
-        self, sampler: Sampler, line: Line, half: float, aside: float, *, onward: bool, least: int = 3
+        self,
+        sampler: Sampler,
+        line: Line,
+        half: float,
+        aside: float,
+        *,
+        onward: bool,
+        thin: bool = False,
+        least: int = 3,
     ) -> tuple[Line, Stretches]:
         """Line of the tube within ``half`` pixels along ``line`` and ``aside`` across, and the bands on it.
 
@@ -286,7 +296,8 @@ class CatheterTracker(nn.Module):
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
         with self._timed("axis"):
             reach = min(0.15, 2 * aside / half) if onward else 0.06
-            line, stretches = find_bands(sampler, self.lens, line, self.table, half, aside, reach, onward=onward)
+            kind = {"onward": onward, "thin": thin}
+            line, stretches = find_bands(sampler, self.lens, line, self.table, half, aside, reach, **kind)
         if stretches.known < least:
             few = "a band is hidden, has the colour of its surroundings or leaves the frame"
             text = f"{stretches.known} edges of bands are seen, {least} are needed: {few}"
@@ -358,7 +369,37 @@ class CatheterTracker(nn.Module):
     ) -> Pose:
         """Pose of the catheter whose bands lie on ``line``; raises a Refusal if a measurement or a check fails.
 
+        If the edges contradict each other, and something lies across the tube beside some of them, the border of this
+        object may have been taken for an edge: then the one pose is taken that leaves out one of these edges.
+        """
+        try:
+            return self._posed(sampler, line, stretches, before, completed=completed)
+        except Refusal as refusal:
+            poses = []
+            for crossed in refusal.crossed:
+                edges, doubtful = stretches.edges.copy(), list(stretches.doubtful)
+                edges[crossed], doubtful[crossed] = np.nan, True
+                others = dataclasses.replace(stretches, edges=edges, doubtful=tuple(doubtful))
+                with suppress(Refusal):
+                    poses.append(self._posed(sampler, line, others, before, crossed=crossed))
+            if len(poses) != 1:
+                raise
+            return poses[0]
+
+    def _posed(
+        self,
+        sampler: Sampler,
+        line: Line,
+        stretches: Stretches,
+        before: LinePose | None,
+        *,
+        completed: bool = False,
+        crossed: int | None = None,
+    ) -> Pose:
+        """The same as :meth:`_along`, from the edges of ``stretches``.
+
         ``completed``: only two edges are known by their colours, so that no other may be missing on the frame.
+        ``crossed``: edge that was left out, and must be either measured elsewhere or hidden.
         """
         lens = self.lens
         with self._timed("axis"):
@@ -406,24 +447,82 @@ class CatheterTracker(nn.Module):
                 expected = np.where(missing, self._expected_edges(line_pose, axis.line), edges.t)
                 doubtful = tuple((missing | np.array(stretches.doubtful)).tolist())
                 edges = measure_edges(sampler, lens, axis, expected, doubtful, edges.blur, curve)
+        missing |= np.isnan(edges.t)
         if completed or missing.any():
-            # Of edges that colours do not show, one that is far less clear than the others is something else.
-            vague = edges.deviation > _SEARCH.vague * edges.deviation.min()
-            absent = vague & ~np.isin(np.arange(len(vague)), edges.outside)
-            if not completed:
-                absent &= np.isfinite(edges.t) | np.isin(np.arange(len(vague)), edges.absent)
-            if absent.any():
-                text = f"edge {absent.argmax()} is not where the others put it, and nothing hides it"
-                raise Refusal(Status.INCONSISTENT, text)
+            edges = self._explained(sampler, axis, edges, missing, completed=completed, crossed=crossed)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
+            self._agreeing(sampler, axis, edges, line_pose)
             pixels = lens.distort(axis.line.plane(edges.t))
             self.edges_px[-1] = torch.from_numpy(np.stack([pixels.real, pixels.imag], -1))
             pose = self._checked(line_pose, width, edges, sampler.height, cold=before is None)
+            lost = np.isnan(edges.t) & ~np.isin(np.arange(len(edges.t)), edges.outside)
+            if before is None and pose.status is Status.UNVERIFIED and lost.any():
+                # A stick with one band of another length shows three edges, too, and nothing hides the fourth.
+                expected = self._expected_edges(line_pose, axis.line)
+                if not all(self._crossed(sampler, axis, edges.t, float(at)) for at in expected[lost]):
+                    raise _unexplained(lost)
             if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
                 text = f"the tube goes on beyond its end on one side only: {_EXCHANGED}"
                 raise Refusal(Status.INCONSISTENT, text, final=True)
             return pose
+
+    def _explained(
+        self,
+        sampler: Sampler,
+        axis: Axis,
+        edges: Edges,
+        missing: np.ndarray,
+        *,
+        completed: bool,
+        crossed: int | None,
+    ) -> Edges:
+        """The edges without those that something hides; a Refusal if one is absent for no reason.
+
+        ``missing`` [N] are the edges that were measured where the others put them. One of these that is far less clear
+        than the others is something else.
+        """
+        number = np.arange(len(edges.t))
+        absent = (edges.deviation > _SEARCH.vague * edges.deviation.min()) & ~np.isin(number, edges.outside)
+        if not completed:
+            absent &= np.isfinite(edges.t) & missing | np.isin(number, edges.absent)
+        if crossed is not None:
+            absent |= number == crossed
+        if not absent.any():
+            return edges
+        rest = dataclasses.replace(
+            edges, t=np.where(absent, np.nan, edges.t), deviation=np.where(absent, np.inf, edges.deviation)
+        )
+        if np.isfinite(rest.t).sum() > 2:
+            expected = self._expected_edges(self._solved(axis, rest, rough=True), axis.line)
+            if crossed is not None and abs(expected[crossed] - edges.t[crossed]) < _NEAR:
+                return edges
+            if all(self._crossed(sampler, axis, rest.t, float(expected[index])) for index in absent.nonzero()[0]):
+                return rest
+        raise _unexplained(absent)
+
+    def _crossed(self, sampler: Sampler, axis: Axis, t: np.ndarray, at: float) -> bool:
+        """Whether something lies across the tube at or beside ``at``.
+
+        The bands between neighbouring edges ``t`` [N] are visible.
+        """
+        spans = [(a, b) for a, b in itertools.pairwise(t.tolist()) if math.isfinite(b - a)]
+        near = at - 2 * _NEAR, at - _NEAR, at, at + _NEAR, at + 2 * _NEAR
+        return bool(spans) and any(lies_across(sampler, self.lens, axis, place, spans) for place in near)
+
+    def _agreeing(self, sampler: Sampler, axis: Axis, edges: Edges, line_pose: LinePose) -> None:
+        """Refuse edges that disagree with their pose; the Refusal names those beside which something lies across."""
+        known = np.isfinite(edges.t).nonzero()[0].tolist()
+        freedom = len(known) - 3  # degrees of freedom of positions along the line; the line is fitted separately
+        if not line_pose.chi_square > self._chi_square_limits[freedom]:
+            return
+        crossed = []
+        for index in known if freedom else ():
+            others = np.where(np.arange(len(edges.t)) == index, np.nan, edges.t)
+            if self._crossed(sampler, axis, others, float(edges.t[index])):
+                crossed.append(index)
+        text = f"edges disagree with any pose: chi-square {line_pose.chi_square:.1f} of {freedom}"
+        raise Refusal(Status.INCONSISTENT, text, final=True, crossed=tuple(crossed))
 
     def _expected_edges(self, line_pose: LinePose, line: Line) -> np.ndarray:
         """Positions [N] in pixels along ``line`` at which a pose puts the centres of the rings of all edges."""
@@ -511,9 +610,6 @@ class CatheterTracker(nn.Module):
         visible = edges.t[np.isfinite(edges.t)]
         count = len(visible)
         freedom = count - 3  # degrees of freedom of positions along the line; the line is fitted separately
-        if line_pose.chi_square > self._chi_square_limits[freedom]:
-            text = f"edges disagree with any pose: chi-square {line_pose.chi_square:.1f} of {freedom}"
-            raise Refusal(Status.INCONSISTENT, text, final=True)
         middle = float(visible.sum()) / count
         near, taper = self._wide(line_pose, axis.line)
         wide = near + taper * middle
@@ -555,6 +651,11 @@ class CatheterTracker(nn.Module):
             yield
         finally:
             self.times[stage] += time.perf_counter() - began
+
+
+def _unexplained(absent: np.ndarray) -> Refusal:
+    text = f"edge {absent.argmax()} is not where the others put it, and nothing hides it"
+    return Refusal(Status.INCONSISTENT, text)
 
 
 def _uncertain(tip_sd: float, most_sd: float) -> str:

@@ -49,11 +49,20 @@ class Refusal(Exception):
         status, reason: Status and reason of the refused pose.
         turned: Whether the bands may appear in the reversed order.
         final: Whether the bands were measured, so that a search elsewhere in the frame is of no use.
+        crossed: Edges beside which something lies across the tube, if edges contradict each other.
     """
 
-    def __init__(self, status: Status, reason: str, *, turned: bool = False, final: bool = False):
+    def __init__(
+        self,
+        status: Status,
+        reason: str,
+        *,
+        turned: bool = False,
+        final: bool = False,
+        crossed: tuple[int, ...] = (),
+    ):
         super().__init__(reason)
-        self.status, self.reason, self.turned, self.final = status, reason, turned, final
+        self.status, self.reason, self.turned, self.final, self.crossed = status, reason, turned, final, crossed
 
 
 @dataclass(frozen=True, eq=False)

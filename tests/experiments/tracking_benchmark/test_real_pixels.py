@@ -70,7 +70,7 @@ def test_a_catheter_before_a_fine_board_is_tracked_because_the_board_is_subtract
 
     with_board = errors()
     monkeypatch.setattr(detection_measure, "_without_background", lambda light, *_: light)
-    assert len(with_board) >= 7 and max(with_board) < 2e-3 and len(errors()) <= 3
+    assert len(with_board) >= 6 and max(with_board) < 2e-3 and len(errors()) <= 3
 
 
 def test_rows_sheet_and_lines():

@@ -1,6 +1,7 @@
 """Edges that colours do not show, from two that they do."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from tracked import WORLD, scenes, truth
 
 from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
-from holotorch.tracking.detection.completion import complete_edges
+from holotorch.tracking.detection.completion import complete_edges, lies_across
+from holotorch.tracking.detection.stations import Axis
 from holotorch.tracking.pose.catheter import THESIS
 
 LENS = Lens(WORLD.camera)
@@ -51,3 +53,27 @@ def test_a_frame_without_steps_gives_some_catheter_all_the_same():
     plain = torch.full((3, 540, 960), 128, dtype=torch.uint8)
     found = complete_edges(Sampler(plain, LENS.light), LENS, line, [math.nan, t[1], t[2], math.nan], POSITIONS)
     assert found is not None and np.isfinite(found).all() and (np.diff(found) > 0).all()
+
+
+def crossed(frame: torch.Tensor, line: Line, at: float, spans: list[tuple[float, float]]) -> bool:
+    fit = SimpleNamespace(unknown=[0.0] * 4 + [0.8])
+    axis = Axis(line, 6.0, 0.0, 0.1, 0.1, 1e-3, 0.0, fit)  # type: ignore[arg-type]
+    return lies_across(Sampler(frame, LENS.light), LENS, axis, at, spans)
+
+
+def test_what_lies_across_shows_on_both_sides_and_ends():
+    """A tube of 6 px along a row, from 100 on, with edges every 100 px; a bar of another colour over its third edge."""
+    line = Line(complex(LENS.undistort(np.array([300.0 + 240.0j]))[0]), 1.0 + 0.0j, LENS.scale)
+    bare = torch.full((3, 480, 640), 90, dtype=torch.uint8)
+    bare[:, 237:244, 100:] = torch.tensor([40, 60, 200], dtype=torch.uint8)[:, None, None]
+    spans, edge = [(-200.0, -100.0), (-100.0, 0.0)], 100.0
+    bar = bare.clone()
+    bar[:, :, 385:420] = torch.tensor([200, 150, 120], dtype=torch.uint8)[:, None, None]
+    assert crossed(bar, line, edge, spans)
+    assert not crossed(bar, line, edge - 50, spans) and not crossed(bare, line, edge, spans)
+    behind, onward, beside = bar.clone(), bar.clone(), bare.clone()
+    behind[:, 237:244] = bare[:, 237:244]  # the tube is in front of the bar
+    onward[:, :, 420:] = bar[:, :, 400:401]  # a background that changes for good
+    beside[:, :238, 385:420] = bar[:, :238, 385:420]  # on one side only
+    assert not any(crossed(frame, line, edge, spans) for frame in (behind, onward, beside))
+    assert not crossed(bar, line, 1e5, spans)  # off the frame

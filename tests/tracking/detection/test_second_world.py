@@ -47,7 +47,24 @@ def test_edges_that_colours_miss_are_measured_where_the_others_put_them(seed, co
     assert float((pose.tip - trial.tip).norm()) < 1e-3
 
 
-@pytest.mark.parametrize("seed", [39, 129, 344])
+@pytest.mark.parametrize(
+    ("seed", "kind"),
+    [
+        (94, "an outer edge under a finger, whose border is measured in its place"),
+        (142, "an outer edge under an instrument, where nothing is measured"),
+        (46, "the border of a finger in the colour of the band that it hides: the edges contradict each other"),
+        (33, "the border of an instrument measured again where the hidden edge is looked for"),
+        (192, "cloth in the colours of two bands, from which only what is thin is kept"),
+    ],
+)
+def test_edges_behind_an_object_are_left_out(seed, kind):
+    trial = WORLD.trial(seed, "occlusion")
+    pose = tracked(trial)
+    assert pose.answered, pose.reason
+    assert float((pose.tip - trial.tip).norm()) < 5 * float(pose.tip_sd) + 1e-4
+
+
+@pytest.mark.parametrize("seed", [39, 60, 92, 106, 109, 129, 156, 344])
 def test_a_stick_with_one_band_of_another_length_is_refused(seed):
     """Its outer edge is not seen by its colours; it is neither where the others put it, nor does anything hide it."""
     pose = tracked(WORLD.negative(seed, "near miss"))
