@@ -104,9 +104,12 @@ def _notes(experiment: JointExperiment) -> list[str]:
     settings, foci = experiment.settings, experiment.foci
     notes = dark_picture(experiment.scene)
     if (error := experiment.budget.error(SLABS)) > COARSE_PLANES:
+        more = 2 * len(foci)
+        # The comparison "slabs" shows one plane in each frame.
+        more_frames = f" frames={more}" if "slabs" in settings.report.baselines else ""
         notes.append(
             f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show "
-            f"slices of it; more planes, such as display.planes={2 * len(foci)}, come closer"
+            f"slices of it; more planes, such as display.planes={more}{more_frames}, come closer"
         )
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
     if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:

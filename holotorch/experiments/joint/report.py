@@ -33,8 +33,11 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
         scores.append(f"the best other method, {NAMES[best]}: {others[best]:.1f} dB at the corrected foci")
     error, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), []
     if error > COARSE_PLANES:
-        notes.append(f"Note       the planes are {error:.0%} off the volume: more of them (display.planes) come closer")
-    return [f"Result     PSNR {'; '.join(scores)}", *notes, *error_line(summary)]
+        notes.append(
+            f"Warning    the planes are {error:.0%} off the volume: they show slices of it, and the PSNR is that of "
+            "these; more of them (display.planes) come closer"
+        )
+    return [*notes, f"Result     PSNR {'; '.join(scores)}", *error_line(summary)]
 
 
 def joint_section(record: RunRecord) -> list[str]:

@@ -33,7 +33,7 @@ COLUMNS = (
 
 _STATED = "the uncertainty from the frames alone, without that of the calibration of the camera and of the band edges"
 _MOVED = 3.0  # largest spread of the tips of a resting catheter, as a multiple of the tracker's standard deviation
-_SHOWN = 4  # number of statuses whose first frame the page shows
+_SHOWN = 4  # number of kinds of refusals that are counted with their first frame
 
 
 class Tracked(NamedTuple):
@@ -82,7 +82,7 @@ class Log:
 
     def wants(self, item: Tracked) -> bool:
         """Whether the page will show the overlay of this frame."""
-        return item.status.name not in self.pictures and len(self.pictures) < _SHOWN
+        return item.status.name not in self.pictures
 
     def take(self, item: Tracked, drawn: Tensor | None) -> None:
         """Add a frame and its overlay, uint8 [3, H, W]."""
@@ -156,7 +156,7 @@ _COLOURS = "are the colours of the catheter's file those of this video? holotorc
 _ADVICE = {
     Status.BAD_FRAME: "is the video of the camera's size, and neither black nor white?",
     Status.NO_CATHETER: _COLOURS,
-    Status.BANDS_MISSING: f"{_COLOURS}; {_LONGER}",
+    Status.BANDS_MISSING: f"is a band covered? Or {_COLOURS}; {_LONGER}",
     Status.NO_AXIS: _COLOURS,
     Status.TOO_NARROW: _LONGER,
     Status.EDGES_UNCLEAR: _LONGER,

@@ -1,5 +1,6 @@
 """The view of a corrected picture: another heat, distance or resolution than the solver assumed, and what it costs."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -8,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from holotorch.core.quantities import SIGMA_PX
 from holotorch.experiments.panel.source import pec_heaters
@@ -18,7 +20,22 @@ from holotorch.experiments.view.controls import Choice, Slider, span
 from holotorch.experiments.view.viewer import Picture, Shown, Viewer, percent
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 
+_COLD = 1e-6  # rise relative to the warmest that counts as none
 _REMEMBERED = 2  # propagators of the last distances, whose kernels may be large
+
+
+def stretched(kernel: Tensor, times: float) -> ThermalCrosstalk:
+    """Heat whose rise at a distance is that of the ``kernel`` [h, w] at 1 / ``times`` of the distance; 0 beyond it.
+
+    Between its taps, the logarithm of the kernel is interpolated bilinearly: exact where heat falls exponentially.
+    """
+    half = [n // 2 for n in kernel.shape]
+    y, x = (torch.arange(-(r := math.ceil(n * times)), r + 1, dtype=torch.float64) / times for n in half)
+    inside = (y.abs()[:, None] <= half[0]) & (x.abs() <= half[1])
+    places = torch.stack(torch.broadcast_tensors(x / max(half[1], 1), y[:, None] / max(half[0], 1)), -1)
+    log = kernel.detach().double().clamp(min=_COLD * float(kernel.max())).log()
+    rise = grid_sample(log[None, None], places[None], padding_mode="border", align_corners=True)[0, 0].exp()
+    return ThermalCrosstalk.from_patch(torch.where(inside & (rise > 2 * _COLD * rise.max()), rise, 0.0).to(kernel))
 
 
 class PECViewer(Viewer):
@@ -33,9 +50,9 @@ class PECViewer(Viewer):
             reference_response=experiment.array.reference_response,
         )
         self._experiment, self._assumed = replace(experiment, array=self._array), experiment.array.crosstalk
-        # On the slider, the Gaussian that fits it best represents a measured kernel.
-        given, kernel = experiment.settings.modulator.sigma_px, experiment.array.crosstalk.kernel
-        self._sigma = ThermalCrosstalk.fitted(kernel).sigma_px if given is None else given
+        # The slider stretches a measured kernel, since no Gaussian may represent it.
+        given = experiment.settings.modulator.sigma_px
+        self._measured, self._sigma = given is None, 1.0 if given is None else given
         self._heaters = pec_heaters(folder, experiment)[:, experiment.lit].to(experiment.device)
         self._target = Picture.of("target", "Target", self._drawn(experiment.image))
         self._at = lru_cache(_REMEMBERED)(self._at_distance)
@@ -53,14 +70,15 @@ class PECViewer(Viewer):
     def _controls(self) -> list[Slider | Choice]:
         settings, distances = self._experiment.settings, self._experiment.distances
         pictures = {"intensity": "the picture", "heaters": "heater phases", "temperature": "temperature of the chip"}
-        sigma = self._sigma
-        given = settings.modulator.sigma_px is not None
-        chip = f"{sigma:g} px" if given else f"a measured kernel, to which {sigma:.3g} px fit best"
+        label, unit, high = "Spread of the heat (sigma)", "px", min(2 * self._sigma + 1, SIGMA_PX.high)
+        text = f"How far heat reaches on the real chip; the phases were computed for {self._sigma:g} px."
+        if self._measured:
+            label, unit, high = "Spread of the heat", "times that of the measured kernel", 2.0
+            text = "The measured kernel, stretched: its rise at a distance is that at 1 / spread of the distance."
         controls: list[Slider | Choice] = [
             Choice("picture", "Show", pictures, "intensity", "What the chip forms, its heaters, or how hot it gets."),
             Slider(
-                "sigma", "Spread of the heat (sigma)", "px", **span(0.0, min(2 * sigma + 1, SIGMA_PX.high), sigma),
-                explanation=f"How far heat reaches on the real chip; the phases were computed for {chip}.",
+                "sigma", label, unit, **span(0.0, high, self._sigma), explanation=text,
             ),
         ]  # fmt: skip
         if distances:
@@ -91,9 +109,7 @@ class PECViewer(Viewer):
         if values["bits"] != "0":
             phase = quantised(phase.clamp(min=0), int(values["bits"]))
         experiment = self._at(values.get("distance"))
-        # All taps of another heat are kept, since those of the configuration may be too few.
-        real = self._assumed if values["sigma"] == self._sigma else ThermalCrosstalk(values["sigma"])
-        self._array.crosstalk = real.to(phase.device)
+        self._array.crosstalk = self._crosstalk(values["sigma"]).to(phase.device)
         warm = self._array.temperature(self._array.crosstalk(phase))
         numbers = {"hottest pixel": f"{float(warm.max()):.0f} degC above ambient"}
         if values["picture"] != "intensity":
@@ -108,6 +124,14 @@ class PECViewer(Viewer):
         efficiency = [share for share in scores["efficiency"] if share > 0]
         numbers["light in the picture"] = percent(sum(efficiency) / max(1, len(efficiency)))
         return Shown([Picture.of("shown", "On the screen", self._drawn(picture)), self._target], numbers)
+
+    def _crosstalk(self, spread: float) -> ThermalCrosstalk:
+        """Heat of another sigma in pixels, or of a measured kernel whose spread is multiplied by ``spread``."""
+        if spread == self._sigma:
+            return self._assumed
+        if self._measured and spread > 0:
+            return stretched(self._assumed.kernel, spread)
+        return ThermalCrosstalk(spread)  # all taps, since those of the configuration may be too few
 
     def _drawn(self, picture: Tensor) -> Tensor:
         """A picture of all colours as it is drawn."""
