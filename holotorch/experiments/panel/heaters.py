@@ -128,8 +128,9 @@ def heaters_text(report: dict[str, Any]) -> str:
         f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s): heater_*: phases in rad that each "
         f"heater alone causes at its own pixel, before the heat spreads (a step of the PNG is {step:.4g} rad, "
         f"{report['heater_bits']} bits); temperature_*: K above ambient, at most {report['peak_temperature_K']:.0f}; "
-        "optical_*: phases of the light in rad after spreading, not modulo 2 pi. A liquid-crystal panel needs "
-        "holotorch export-slm instead" + warning
+        "optical_*: phases of the light in rad after spreading, not modulo 2 pi. What fewer bits cost, holotorch view "
+        "of the run shows (Levels of the heaters), and modulator.bits computes a run for them. A liquid-crystal panel "
+        "needs holotorch export-slm instead" + warning
     )
 
 

@@ -168,6 +168,7 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
 
 
 _SAME_ASPECT = 0.01  # relative change of an aspect ratio that nobody sees
+_WARM = 0.02  # mean rise along a side of a measured kernel, relative to its centre, above which heat is missing
 _NO_GAUSSIAN = 0.05  # rest of a fit above which corrections for the Gaussian lose much of their gain
 
 
@@ -225,6 +226,16 @@ def _padding_reason(experiment: PECExperiment) -> str:
     return "unpadded: the far field of the array, sampled once per pixel"
 
 
+def _warm_ring(experiment: PECExperiment) -> float:
+    """Largest mean rise along a side of a measured kernel, relative to its centre; 0 for a Gaussian one."""
+    if experiment.settings.modulator.kernel is None:
+        return 0.0
+    kernel = experiment.array.crosstalk.kernel
+    middle = kernel[kernel.shape[0] // 2, kernel.shape[1] // 2]
+    sides = [side.mean() for side in (kernel[0], kernel[-1], kernel[:, 0], kernel[:, -1]) if kernel.numel() > len(side)]
+    return float(max(sides, default=0.0 * middle) / middle)
+
+
 def _notes(experiment: PECExperiment) -> list[str]:
     """Warnings about the limits of the model."""
     notes = []
@@ -259,6 +270,11 @@ def _notes(experiment: PECExperiment) -> list[str]:
     lost = experiment.array.crosstalk.lost_heat
     if lost > 0.01:
         notes.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
+    if (ring := _warm_ring(experiment)) > _WARM:
+        notes.append(
+            f"the measured kernel is cut off where the rise is still {ring:.1%} of that of its centre: the heat beyond "
+            "is not in the model; give more rows and columns, or subtract what is not heat"
+        )
     if dark := [i for i, on in enumerate(experiment.lit.tolist()) if not on]:
         notes.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
     if experiment.source.mean() < 0.02:

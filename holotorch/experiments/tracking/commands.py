@@ -40,8 +40,8 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     calibrate._negative_number_matcher = re.compile(r"-\.?\d")
     calibrate.add_argument("--axes", help="of the headset's frame: RDF (default), RUB (WebXR), RUF (Unity), ...")
     about = (
-        "of a catheter: where each band is on the photograph, from the tip on, in pixels: X,Y or X0,Y0,X1,Y1; without "
-        "it, the first frame of a video is saved as a picture"
+        "of a catheter: where each band is on the photograph, from the tip on, in pixels: X,Y, or X0,Y0,X1,Y1 of a box "
+        "that lies within the band; without it, the first frame of a video is saved as a picture"
     )
     calibrate.add_argument("--bands", nargs="+", metavar="PLACE", help=about)
     about = "of a catheter: YAML file whose edges, radius and length are kept (default: configs/tracking/catheter.yaml)"

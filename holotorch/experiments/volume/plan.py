@@ -179,7 +179,7 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
         twice = 2 * len(experiment.depths) * experiment.settings.scale
         notes.append(
             f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: more planes, such as "
-            f"hologram.depths={twice}, come closer, at little cost with axial nodes"
+            f"hologram.depths={twice} for about half of that, come closer, at little cost with axial nodes"
         )
     if words := preset_note(experiment):
         notes.append(words)

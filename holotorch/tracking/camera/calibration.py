@@ -276,8 +276,7 @@ def _warnings(
         f"The boards differ by {math.degrees(coverage.between):.0f} degrees at most: tilt the board more, to several "
         "sides.": count > 1 and coverage.between < math.radians(25),
         f"The corners scatter by {scatter:.1f} px: is the board flat, the picture sharp?": scatter > _SCATTER,
-        "The fitted distortion cannot be inverted in the picture's corners: no poses there.": bool(
-            camera.undistort(corners).isnan().any()
-        ),
+        "The fitted distortion cannot be inverted in the picture's corners: no poses there. Take views with the board "
+        "there.": bool(camera.undistort(corners).isnan().any()),
     }
     return tuple(text for text, applies in warnings.items() if applies)

@@ -41,6 +41,8 @@ def test_planes_that_are_slices_of_a_volume_rather_than_the_volume_are_noted():
     assert error > 0.5
     (note,) = [line for line in plan.text.splitlines() if "off this volume" in line]
     assert f"2 planes are {error:.0%} off" in note and "such as display.planes=4, come closer" in note
+    with_slabs = check(settings("display.planes=2", "frames=2", "report.baselines=[slabs]"))
+    assert "such as display.planes=4 frames=4, come closer" in with_slabs.text
 
 
 def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():

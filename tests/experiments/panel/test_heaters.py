@@ -47,14 +47,24 @@ def test_a_measured_gaussian_gives_what_its_sigma_gives(known, tmp_path, suffix,
     plan = json.loads((tmp_path / "b" / "plan.json").read_text())["crosstalk"]
     assert plan["fitted_sigma_px"] == pytest.approx(0.66, abs=1e-3) and plan["fit_residual"] < 1e-3
     said = capsys.readouterr().out
-    assert "has sigma 0.66 px" in said and "no Gaussian represents" not in said
+    assert "has sigma 0.66 px" in said and "no Gaussian represents" not in said and "cut off" not in said
 
 
 def test_a_kernel_that_is_no_gaussian_is_said(tmp_path, capsys):
     y, x = np.mgrid[-3:4, -3:4]
     np.savetxt(tmp_path / "kernel.csv", np.exp(-np.hypot(y, x) / 0.6), delimiter=",")
     assert main(["check", *SMALL, f"modulator={{kernel: {tmp_path / 'kernel.csv'}}}"]) == 0
-    assert "no Gaussian represents this kernel" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "no Gaussian represents this kernel" in said and "cut off" not in said  # exp(-5) at the nearest border
+
+
+def test_a_kernel_that_is_cut_off_while_it_is_warm_is_noted(tmp_path, capsys):
+    """exp(-d) on the rows 3 px from the centre, the warmer sides: a mean of 2.7 %."""
+    y, x = np.mgrid[-3:4, -4:5]
+    rise = np.exp(-np.hypot(y, x))
+    np.savetxt(tmp_path / "kernel.csv", rise, delimiter=",")
+    assert main(["check", *SMALL, f"modulator={{kernel: {tmp_path / 'kernel.csv'}}}"]) == 0
+    assert f"cut off where the rise is still {rise[0].mean():.1%} of that of its centre" in capsys.readouterr().out
 
 
 def test_a_kernel_beside_a_sigma_is_told_how_to_take_its_place(tmp_path, capsys):
