@@ -7,7 +7,7 @@ from tiny_runs import RUNS
 
 from holotorch.experiments.execute import execute
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.view.controls import checked
+from holotorch.experiments.view.controls import Slider, checked
 from holotorch.experiments.view.kinds.pec import stretched
 from holotorch.experiments.view.opening import open_viewer
 
@@ -41,7 +41,7 @@ def test_the_page_of_a_measured_kernel_stretches_it(tmp_path):
     chip = [f"modulator.kernel={kernel}", "modulator.sigma_px=null", "modulator.kernel_size=null"]
     assert execute(load_config(CONFIGS / config, [*words, *chip]), tmp_path / "run")[1]
     viewer = open_viewer(tmp_path / "run")
-    slider = next(control for control in viewer.controls if control.name == "sigma")
+    (slider,) = (control for control in viewer.controls if isinstance(control, Slider) and control.name == "sigma")
     assert slider.unit == "times that of the measured kernel" and slider.value == 1
 
     def psnr(**changes) -> float:
