@@ -70,7 +70,7 @@ class Log:
         first, stage = solution.state["inner_losses"][0], int(solution.state["stage"]) + 1
         relative = (solution.losses[-1] / first.clamp(min=1e-30)).mean().item()
         shown = {"stage": f"{stage}/{self._stages}"} if self._stages > 1 else {}
-        shown |= {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
+        shown |= {"loss/start": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
         if self.checked:
             shown[self.metric] = f"{self.checked[-1][1]:.4f}"
         self.bar.set_postfix(shown, refresh=False)

@@ -375,16 +375,19 @@ class CatheterTracker(nn.Module):
         try:
             return self._posed(sampler, line, stretches, before, completed=completed)
         except Refusal as refusal:
-            poses = []
+            found, measured = [], self.edges_px[-1]
             for crossed in refusal.crossed:
                 edges, doubtful = stretches.edges.copy(), list(stretches.doubtful)
                 edges[crossed], doubtful[crossed] = np.nan, True
                 others = dataclasses.replace(stretches, edges=edges, doubtful=tuple(doubtful))
                 with suppress(Refusal):
-                    poses.append(self._posed(sampler, line, others, before, crossed=crossed))
-            if len(poses) != 1:
+                    pose = self._posed(sampler, line, others, before, crossed=crossed)
+                    found.append((pose, self.edges_px[-1]))
+            self.edges_px[-1] = measured
+            if len(found) != 1:
                 raise
-            return poses[0]
+            pose, self.edges_px[-1] = found[0]
+            return pose
 
     def _posed(
         self,
@@ -452,9 +455,9 @@ class CatheterTracker(nn.Module):
             edges = self._explained(sampler, axis, edges, missing, completed=completed, crossed=crossed)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
-            self._agreeing(sampler, axis, edges, line_pose)
             pixels = lens.distort(axis.line.plane(edges.t))
             self.edges_px[-1] = torch.from_numpy(np.stack([pixels.real, pixels.imag], -1))
+            self._agreeing(sampler, axis, edges, line_pose)
             pose = self._checked(line_pose, width, edges, sampler.height, cold=before is None)
             lost = np.isnan(edges.t) & ~np.isin(np.arange(len(edges.t)), edges.outside)
             if before is None and pose.status is Status.UNVERIFIED and lost.any():
