@@ -210,7 +210,9 @@ def _listed(values: list[float], form: str = ".3g") -> str:
 def _heat(experiment: PECExperiment) -> str:
     """Text on the temperature limit and the resolution of the heaters."""
     limit, bits = experiment.limit, experiment.settings.modulator.bits
+    chip = experiment.settings.modulator
     steps = "" if bits is None else f"; heaters with {2**bits} steps"
+    steps += f"; modulator.rad_per_K={chip.rad_per_K:.4g} at 630 nm"
     if limit is None:
         return "no limit, as in the thesis: the hottest pixel is reported" + steps
     kelvin = [limit / response for response in experiment.array.response]

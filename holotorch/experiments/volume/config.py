@@ -108,13 +108,16 @@ class ScatteringSettings(Settings):
 class ViewSettings(Settings):
     """Orientation and size of the volume.
 
-    The volume is rotated by ``azimuth_deg`` about the vertical axis (y), then by ``elevation_deg`` about the horizontal
-    axis (x). ``width`` is the length of its longest side in metres, by default the longest side of the hologram.
+    ``up`` is the direction of the volume that points up: -y shows its first row on top; z or -z stands a scan in axial
+    slices upright. The volume is then rotated by ``azimuth_deg`` about the vertical axis, and by ``elevation_deg``
+    about the horizontal axis (x). ``width`` is the length of its longest side in metres, by default the longest side of
+    the hologram.
     ``front`` says which end of the volume faces the observer. ``lighting`` shades points by the gradient of the volume;
     ``scattering`` in its place gives the volume shadows.
     ``adaptive``: follow all rays only where colours or opacity of every fourth ray differ by more than this.
     """
 
+    up: Literal["-y", "y", "z", "-z", "x", "-x"] = "-y"
     azimuth_deg: Number = 0.0
     elevation_deg: Number = 0.0
     width: Annotated[Length, plausible(WIDTH)] | None = None

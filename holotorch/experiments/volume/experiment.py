@@ -51,6 +51,18 @@ _SETTINGS = (
 )
 
 
+# Rotations, for vectors (z, y, x), that make a direction of the volume point up, which is -y: about the horizontal axis
+# for z, and about the axis of sight for x and y.
+_STANDING = {
+    "-y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "z": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+    "-z": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+    "x": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "-x": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+}
+
+
 @dataclass(frozen=True)
 class VolumeExperiment:
     """The volume, geometry and operators that a configuration describes."""
@@ -94,9 +106,10 @@ class VolumeExperiment:
         """Rotation matrix of the volume about its middle, for vectors (z, y, x)."""
         view = self.settings.view
         a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
-        about_y = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
-        about_x = torch.tensor([[math.cos(e), -math.sin(e), 0], [math.sin(e), math.cos(e), 0], [0, 0, 1]])
-        return (about_x.double() @ about_y.double()).round(decimals=15)
+        about_y = ((math.cos(a), 0, math.sin(a)), (0, 1, 0), (-math.sin(a), 0, math.cos(a)))
+        about_x = ((math.cos(e), -math.sin(e), 0), (math.sin(e), math.cos(e), 0), (0, 0, 1))
+        turns = [torch.tensor(rows, dtype=torch.float64) for rows in (about_x, about_y, _STANDING[view.up])]
+        return (turns[0] @ turns[1] @ turns[2]).round(decimals=15)
 
     @cached_property
     def depths(self) -> tuple[float, ...]:

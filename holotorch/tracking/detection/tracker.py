@@ -99,7 +99,7 @@ _FLOORS, _CHECK, _SEARCH = ErrorFloors(), WidthCheck(), SearchLimits()
 MOST_SD = 2e-3  # metres: deviation of a tip above which its pose is of no use
 _NEAR = 6.0  # pixels from an edge up to which something that lies across the tube disturbs its measurement
 _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
-_EXCHANGED = "exchanged red and blue channels can cause this; state the order of the channels (ChannelOrder)"
+_EXCHANGED = "exchanged red and blue channels (ChannelOrder), or bands not named from the tip on, can cause this"
 
 
 class CatheterTracker(nn.Module):

@@ -301,5 +301,5 @@ def test_the_progress_bar_names_the_stage_and_its_loss_never_jumps_up(words, sta
     assert execute(settings(*words), tmp_path / "run")[1]
     names = [f"{k}/{len(stages)}" for k, steps in enumerate(stages, 1) for _ in range(steps)]
     assert [each["stage"] for each in shown] == names
-    for before, after in zip([{"stage": "", "loss": ""}, *shown], shown, strict=False):
-        assert float(after["loss"]) <= (float(before["loss"]) if before["stage"] == after["stage"] else 1.0)
+    for before, after in zip([{"stage": "", "loss/start": ""}, *shown], shown, strict=False):
+        assert float(after["loss/start"]) <= (float(before["loss/start"]) if before["stage"] == after["stage"] else 1.0)
