@@ -44,6 +44,7 @@ HEAT = "Heat       "
 NO_LIMIT = HEAT + "no limit, as in the thesis: the hottest pixel is reported"
 SHARED = "700 / 589 / 494 degC above ambient of the colours, which share this limit"
 FOUR_PI = f"{HEAT}the phase after spreading stays below 12.57 rad, {SHARED}"
+RESPONSE = "; modulator.rad_per_K=0.01795 at 630 nm"
 FRAMES = "Frames     4, shown in turn and solved for {}; the eye sees their mean"
 
 
@@ -52,11 +53,11 @@ def test_check_says_how_hot_and_how_many_frames(path, capsys):
     assert main(["check", str(path)]) == 0
     out = capsys.readouterr().out.splitlines()
     capped = path.stem == "capped"
-    assert [line for line in out if line.startswith(HEAT)] == [FOUR_PI if capped else NO_LIMIT]
+    assert [line for line in out if line.startswith(HEAT)] == [(FOUR_PI if capped else NO_LIMIT) + RESPONSE]
     assert [line for line in out if line.startswith("Frames")] == ([FRAMES.format("together")] if capped else [])
     assert main(["check", str(path), "frames=4", "multiplexing=independent", "modulator.bits=6"]) == 0
     out = capsys.readouterr().out.splitlines()
-    assert (FOUR_PI if capped else NO_LIMIT) + "; heaters with 64 steps" in out
+    assert (FOUR_PI if capped else NO_LIMIT) + "; heaters with 64 steps" + RESPONSE in out
     assert FRAMES.format("one by one") in out
     (crosstalk,) = (line for line in out if line.startswith("Crosstalk"))
     assert (
