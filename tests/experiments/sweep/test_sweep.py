@@ -167,7 +167,7 @@ def test_a_signal_reaches_the_runs_side_by_side(tmp_path):
     command = [sys.executable, "-m", "holotorch", "sweep", *words, "--jobs", "2", "--out", str(out)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, env=os.environ | {"OMP_NUM_THREADS": "1"})
     end = time.monotonic() + 60
-    while sum("loss=" in path.read_text() for path in out.glob("*.log")) < 2 and time.monotonic() < end:
+    while sum("loss/start=" in path.read_text() for path in out.glob("*.log")) < 2 and time.monotonic() < end:
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=60)
