@@ -108,8 +108,8 @@ class VolumeExperiment:
         a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
         about_y = ((math.cos(a), 0, math.sin(a)), (0, 1, 0), (-math.sin(a), 0, math.cos(a)))
         about_x = ((math.cos(e), -math.sin(e), 0), (math.sin(e), math.cos(e), 0), (0, 0, 1))
-        turns = [torch.tensor(rows, dtype=torch.float64) for rows in (about_x, about_y, _STANDING[view.up])]
-        return (turns[0] @ turns[1] @ turns[2]).round(decimals=15)
+        x, y, standing = (torch.tensor(rows, dtype=torch.float64) for rows in (about_x, about_y, _STANDING[view.up]))
+        return (x @ y @ standing).round(decimals=15)
 
     @cached_property
     def depths(self) -> tuple[float, ...]:

@@ -12,14 +12,13 @@ import numpy as np
 from torch import Tensor
 
 from holotorch.tracking.detection.bands import order_scores
-from holotorch.tracking.detection.colours import ColourTable
+from holotorch.tracking.detection.colours import ALIKE, ColourTable
 from holotorch.tracking.pose.status import Refusal, Status
 
 _STEP = 2  # distance of coarse pixels, in pixels
 _TILE = 12  # side of a tile in coarse pixels
 _AWAY = 14  # distance from a pixel to its surroundings, in coarse pixels; over half the width of the widest tube
 _PATCH = 5  # side of the square whose median is the colour of the surroundings, in coarse pixels
-_ALIKE = 14  # largest difference of equal colours in each channel, in levels; several times the noise
 _DENSE = 0.35  # fraction of a colour in a tile and its neighbours above which the object is not thin
 _FEWEST = 6  # least number of coarse pixels of a part
 _TILES = 80  # largest number of parts of each colour that are used
@@ -102,7 +101,7 @@ def _thin(frame: Tensor) -> np.ndarray:
     # Two directions would do for a lone tube. With four, an object beside it hides it less often.
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         thin = cv2.max(thin, cv2.min(differs(down, right), differs(-down, -right)))
-    return cv2.threshold(thin, _ALIKE, 255, cv2.THRESH_BINARY)[1]
+    return cv2.threshold(thin, ALIKE, 255, cv2.THRESH_BINARY)[1]
 
 
 @dataclass(frozen=True, eq=False)

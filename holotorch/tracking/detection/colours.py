@@ -13,6 +13,7 @@ from holotorch.tracking.pose.catheter import NO_GAPS, Catheter
 _BITS = 5  # bits of each channel in the index of the table
 _TURN = math.radians(32)  # largest angle between the chroma vectors of a pixel and of its band, in linear light
 _PURE = 0.35  # least saturation of a pixel relative to that of its band; gloss and mixed pixels are less saturated
+ALIKE = 14.0  # largest difference of equal colours in each channel, in levels; several times the noise
 _DARK = 24 / 255  # least value of the brightest channel; darker pixels are noise
 
 

@@ -86,13 +86,14 @@ def lies_across(
 
     Beside the tube such an object has, on both sides, a colour that is not beside the visible tube; ``spans`` are the
     first and last positions of the parts that are surely visible. And on the tube it has the colour that it has beside
-    the tube. The object ends on both sides: a background that changes for good at the end of a band is none.
+    the tube. The object ends on both sides: a background that changes for good at the end of a band is none. There must
+    be a span; False if the position is off the frame, or if no span is on it.
     """
     middle = at + np.arange(-check.near, check.near + 1.0)
     if not sampler.inside(lens.distort(axis.line.plane(middle))).all():
         return False
     low, high = min(a for a, _ in spans), max(b for _, b in spans)
-    reach, beyond = check.slant + check.near, check.beyond * (high - low)
+    extent, beyond = check.slant + check.near, check.beyond * (high - low)
     t = np.arange(math.floor(min(low, at - beyond)), math.ceil(max(high, at + beyond)) + 1.0)
     side = axis.width_at(t)[:, None] / 2 + 2 * axis.blur + np.array(check.beside)
     u = np.concatenate([-side, np.tile([-0.5, 0.5], (len(t), 1)), side], 1)
@@ -102,7 +103,7 @@ def lies_across(
     one, tube, other = (part.mean(1) for part in np.split(light, [3, 5], 1))
     known = (inside & np.any([(t >= a) & (t <= b) for a, b in spans], 0)).nonzero()[0]
     known = known[:: 1 + len(known) // check.samples]
-    close, window = np.abs(t - at) <= reach, np.ones(len(middle))
+    close, window = np.abs(t - at) <= extent, np.ones(len(middle))
     if not len(known):
         return False
     new = np.stack([inside & (_apart(beside, beside[known]) > check.new) for beside in (one, other)])
@@ -111,8 +112,8 @@ def lies_across(
     old = [np.convolve(inside & ~close & ~each, window, "same") > len(window) - 0.5 for each in new]
     if not all((each & (t < at)).any() and (each & (t > at)).any() for each in old):
         return False
-    seen = np.concatenate([one[new[0] & close], other[new[1] & close]])
-    return float((_apart(tube[np.abs(t - at) <= check.near], seen) <= check.new).mean()) >= check.most
+    hiding = np.concatenate([one[new[0] & close], other[new[1] & close]])
+    return float((_apart(tube[np.abs(t - at) <= check.near], hiding) <= check.new).mean()) >= check.most
 
 
 def _apart(colours: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.detection.bands import Stretches, find_axis, find_stretches
-from holotorch.tracking.detection.colours import ColourTable
+from holotorch.tracking.detection.colours import ALIKE, ColourTable
 from holotorch.tracking.detection.fits import EdgeFit, fit_edges, median
 from holotorch.tracking.detection.footprint import Front
 from holotorch.tracking.detection.luma import coarse_colours, fit_luma
@@ -32,7 +32,6 @@ class StripSearch:
     pale: float = 1.05  # largest chroma of a clear tube over that of the background beside it
     beside: float = 14.0  # distance from the axis at which the background is read, in pixels; beside the widest tubes
     averaged: int = 2  # pixels on either side of that distance whose mean is the background
-    alike: float = 14.0  # largest difference of equal colours in each channel, in levels; several times the noise
     halfway: int = 6  # samples on either side of a change of labels
     halfway_ends: int = 3  # outermost samples on either side that surely show one colour
 
@@ -175,7 +174,7 @@ def _thin(sampler: Sampler, lens: Lens, line: Line, t: np.ndarray, u: np.ndarray
     means = (sums[:, width:] - sums[:, :-width]) / width  # around u[0] - side to u[-1] + side
     own = levels[:, side + _SEARCH.averaged :][:, :count]
     gaps = [np.abs(own - mean).max(-1) for mean in (means[:, :count], means[:, 2 * side :])]
-    return np.minimum(*gaps) > _SEARCH.alike
+    return np.minimum(*gaps) > ALIKE
 
 
 def halfway(sampler: Sampler, lens: Lens, line: Line, edges: np.ndarray) -> np.ndarray:

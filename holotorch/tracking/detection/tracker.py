@@ -97,7 +97,9 @@ class SearchLimits:
 
 _FLOORS, _CHECK, _SEARCH = ErrorFloors(), WidthCheck(), SearchLimits()
 MOST_SD = 2e-3  # metres: deviation of a tip above which its pose is of no use
-_NEAR = 6.0  # pixels from an edge up to which something that lies across the tube disturbs its measurement
+_NEAR = (
+    6.0  # pixels: half the distance up to which an object across the tube disturbs an edge, and error of a rough pose
+)
 _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
 _EXCHANGED = "exchanged red and blue channels (ChannelOrder), or bands not named from the tip on, can cause this"
 
@@ -375,18 +377,18 @@ class CatheterTracker(nn.Module):
         try:
             return self._posed(sampler, line, stretches, before, completed=completed)
         except Refusal as refusal:
-            found, measured = [], self.edges_px[-1]
+            others, measured = [], self.edges_px[-1]
             for crossed in refusal.crossed:
                 edges, doubtful = stretches.edges.copy(), list(stretches.doubtful)
                 edges[crossed], doubtful[crossed] = np.nan, True
-                others = dataclasses.replace(stretches, edges=edges, doubtful=tuple(doubtful))
+                fewer = dataclasses.replace(stretches, edges=edges, doubtful=tuple(doubtful))
                 with suppress(Refusal):
-                    pose = self._posed(sampler, line, others, before, crossed=crossed)
-                    found.append((pose, self.edges_px[-1]))
+                    pose = self._posed(sampler, line, fewer, before, crossed=crossed)
+                    others.append((pose, self.edges_px[-1]))
             self.edges_px[-1] = measured
-            if len(found) != 1:
+            if len(others) != 1:
                 raise
-            pose, self.edges_px[-1] = found[0]
+            pose, self.edges_px[-1] = others[0]
             return pose
 
     def _posed(
@@ -657,6 +659,7 @@ class CatheterTracker(nn.Module):
 
 
 def _unexplained(absent: np.ndarray) -> Refusal:
+    """Refusal that names the first of the ``absent`` edges, bool [N]."""
     text = f"edge {absent.argmax()} is not where the others put it, and nothing hides it"
     return Refusal(Status.INCONSISTENT, text)
 

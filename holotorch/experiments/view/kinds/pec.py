@@ -27,14 +27,15 @@ _REMEMBERED = 2  # propagators of the last distances, whose kernels may be large
 def stretched(kernel: Tensor, times: float) -> ThermalCrosstalk:
     """Heat whose rise at a distance is that of the ``kernel`` [h, w] at 1 / ``times`` of the distance; 0 beyond it.
 
-    Between its taps, the logarithm of the kernel is interpolated bilinearly: exact where heat falls exponentially.
+    ``times`` is above 0. Between its taps, the logarithm of the kernel is interpolated bilinearly: exact where heat
+    falls exponentially. Rises below 1e-6 of the warmest are 0.
     """
     half = [n // 2 for n in kernel.shape]
     y, x = (torch.arange(-(r := math.ceil(n * times)), r + 1, dtype=torch.float64) / times for n in half)
     inside = (y.abs()[:, None] <= half[0]) & (x.abs() <= half[1])
-    places = torch.stack(torch.broadcast_tensors(x / max(half[1], 1), y[:, None] / max(half[0], 1)), -1)
+    at = torch.stack(torch.broadcast_tensors(x / max(half[1], 1), y[:, None] / max(half[0], 1)), -1)
     log = kernel.detach().double().clamp(min=_COLD * float(kernel.max())).log()
-    rise = grid_sample(log[None, None], places[None], padding_mode="border", align_corners=True)[0, 0].exp()
+    rise = grid_sample(log[None, None], at[None], padding_mode="border", align_corners=True)[0, 0].exp()
     return ThermalCrosstalk.from_patch(torch.where(inside & (rise > 2 * _COLD * rise.max()), rise, 0.0).to(kernel))
 
 
