@@ -1,6 +1,5 @@
 """What a module learns and what it keeps: one rule for the values and tensors that a module is built from."""
 
-import copy
 import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -67,15 +66,22 @@ class PreciseModule(nn.Module):
 
     def present(self, name: str) -> Any:
         """The adopted dataclass with the module's present Parameters, which ``functional_call`` may have replaced."""
-        settings = copy.copy(getattr(self, name))
+        settings, learned = getattr(self, name), {}
         for field in dataclasses.fields(settings):
             value, own = getattr(settings, field.name), f"{name}_{field.name}"
             if isinstance(value, nn.Parameter):
-                object.__setattr__(settings, field.name, getattr(self, own))
+                learned[field.name] = getattr(self, own)
             elif isinstance(value, Mapping) and any(isinstance(each, nn.Parameter) for each in value.values()):
-                items = {k: getattr(self, f"{own}_{k}") if isinstance(v, nn.Parameter) else v for k, v in value.items()}
-                object.__setattr__(settings, field.name, items)
-        return settings
+                learned[field.name] = {
+                    k: getattr(self, f"{own}_{k}") if isinstance(v, nn.Parameter) else v for k, v in value.items()
+                }
+        if not learned:
+            return settings
+        present = object.__new__(type(settings))  # as copy.copy, which torch.compile cannot follow until torch 2.11
+        for field in dataclasses.fields(settings):
+            value = learned.get(field.name, getattr(settings, field.name))
+            object.__setattr__(present, field.name, value)
+        return present
 
     def _apply(self, fn, recurse=True):
         def moved(tensor: Tensor) -> Tensor:

@@ -6,6 +6,8 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
+from holotorch.core.tracing import constant_when_compiled
+
 
 def at_least_single(values: Tensor) -> Tensor:
     """``values`` in float32 if they are float16 or bfloat16, otherwise unchanged.
@@ -23,4 +25,9 @@ def double(value: Tensor | float | Sequence[float], device: torch.device) -> Ten
 def without_autocast(values: Tensor) -> AbstractContextManager[object]:
     """Context in which products of matrices, which autocast would round, keep the dtype of ``values``."""
     device = values.device.type
-    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
+    return torch.autocast(device, enabled=False) if _has_autocast(device) else nullcontext()
+
+
+@constant_when_compiled
+def _has_autocast(device: str) -> bool:
+    return torch.amp.is_autocast_available(device)

@@ -125,13 +125,27 @@ class AxialHologram(LayerHologram):
 
     def design(self, shape: tuple[int, int]) -> AxialDesign:
         """Nodes, transform sizes and predicted error for layers of ``shape`` (h, w); computed once per shape."""
-        _keep_design(self, shape)
+        self._keep_design(shape)
         return self._designs[shape]
 
     def checked_design(self, shape: tuple[int, int]) -> AxialDesign:
         """The design for layers of ``shape`` (h, w); warns if its predicted error exceeds the tolerance."""
-        _keep_design(self, shape, warn=True)
+        self._keep_design(shape, warn=True)
         return self._designs[shape]
+
+    @constant_when_compiled
+    def _keep_design(self, shape: tuple[int, int], *, warn: bool = False) -> None:
+        """Have the design for ``shape``; computed when torch.compile traces, which cannot follow NumPy."""
+        if shape not in self._designs:
+            self._designs[shape] = self._choose_design(shape)
+        design = self._designs[shape]
+        if warn and not design.adequate:
+            warnings.warn(
+                f"the hologram's relative error is about {design.predicted_error:.1e}, and its tolerance "
+                f"{self.tolerance:.1e}: use ConvolutionHologram, cone='taper' or a larger tolerance",
+                checks.SamplingWarning,
+                stacklevel=3,
+            )
 
     def _choose_design(self, shape: tuple[int, int]) -> AxialDesign:
         common = self.wavelength, min(self.depths), max(self.depths), self.cone
@@ -200,21 +214,6 @@ class AxialHologram(LayerHologram):
                     layers[j] += layer * weights[j][m - begins[j]].conjugate()
                 spectrum *= back
         return out
-
-
-@constant_when_compiled
-def _keep_design(operator: AxialHologram, shape: tuple[int, int], *, warn: bool = False) -> None:
-    """Have the design for ``shape`` in ``operator``; computed when torch.compile traces, which cannot follow NumPy."""
-    if shape not in operator._designs:
-        operator._designs[shape] = operator._choose_design(shape)
-    design = operator._designs[shape]
-    if warn and not design.adequate:
-        warnings.warn(
-            f"the hologram's relative error is about {design.predicted_error:.1e}, and its tolerance "
-            f"{operator.tolerance:.1e}: use ConvolutionHologram, cone='taper' or a larger tolerance",
-            checks.SamplingWarning,
-            stacklevel=3,
-        )
 
 
 class Accumulator:

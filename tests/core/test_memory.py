@@ -86,7 +86,7 @@ REFUSED = {
     "an aperture on 10000000 x 10000000 samples": lambda: Aperture(HUGE, WAVE, 1e-3),
     "the lens of an eye on 10000000 x 10000000 samples in 2 ": lambda: EyeLens(HUGE, (WAVE, 630e-9), Eye()),
     "the kernel of AngularSpectrum on 5120000 x 5120000 samp": lambda: AngularSpectrum(GRID, WAVE, 1e-2, pad=1e4),
-    "the kernel of Fresnel on 5120000 x 512 samples in 1 cha": lambda: Fresnel(GRID, WAVE, 1e-2, pad=(1e4, 1)),
+    "the kernel of Fresnel on 512000000 x 512 samples in 1 c": lambda: Fresnel(GRID, WAVE, 1e-2, pad=(1e6, 1)),
     "ConvergingFresnel from 512 x 512 to 100000000000 x 1000": lambda: ConvergingFresnel(
         GRID, WAVE, 0.1, 0.2, out_grid=Grid(10**11, 1e-9)
     ),

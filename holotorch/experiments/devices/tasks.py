@@ -17,9 +17,9 @@ from holotorch.experiments.volume.chart import PITCH, TABLE, WAVELENGTHS, WHOLE,
 from holotorch.hologram import AxialHologram
 from holotorch.optics import Display, Eye, Propagator, PupilViews, Retina, View
 from holotorch.optics.viewing.display_geometry import eyepiece_distance
-from holotorch.tracking import CatheterTracker, ChannelOrder, ThesisTracker
+from holotorch.tracking import CatheterTracker, ChannelOrder, PhotometricFit, ThesisTracker
 from holotorch.tracking.simulation.trials import conditions
-from holotorch.tracking.simulation.world import World
+from holotorch.tracking.simulation.world import Case, World
 
 THESIS, OURS = "thesis's convolutions (Algorithm 5)", "axial nodes, 3e-3"
 _PLANES = 3  # of the thesis's method, whose time is scaled to all planes and colours
@@ -84,6 +84,8 @@ def tasks(amount: Amount) -> Iterator[Task]:
     for method, tracker in (("thesis, kornia", ThesisTracker), ("ours, cold", CatheterTracker)):
         build = partial(_tracked, amount.frames, tracker)
         yield Task(f"catheter, batch of {amount.frames} frames, 1080p", method, "frame", build, each)
+    fitted = partial(_fitted, amount.frames)
+    yield Task(f"catheter, batch of {amount.frames} frames, 1080p", "PhotometricFit", "frame", fitted, each)
 
 
 def _convolutions(scene: Scene, device: torch.device) -> Callable[[], Tensor]:
@@ -160,10 +162,26 @@ def _joint(side: int, device: torch.device) -> Callable[[], Tensor]:
 def _tracked(
     count: int, tracker: type[ThesisTracker] | type[CatheterTracker], device: torch.device
 ) -> Callable[[], Tensor]:
+    world, _, frames = _plain(count)
+    track = tracker(world.camera, world.catheter, channels=ChannelOrder.RGB)
+    frames = frames.to(device)
+    return lambda: torch.stack([pose.tip.detach().cpu() for pose in track(frames)])
+
+
+def _fitted(count: int, device: torch.device) -> Callable[[], Tensor]:
+    """The fit alone, from poses that are 2 mm off; tips [count, 3]."""
+    world, cases, frames = _plain(count)
+    fit = PhotometricFit(world.camera, world.catheter).to(device)
+    tips, directions = (torch.stack([getattr(case, name) for case in cases]) for name in ("tip", "direction"))
+    start = tips + torch.tensor([1e-3, -1e-3, 1.4e-3], dtype=torch.float64)
+    frames, start, directions = (each.to(device) for each in (frames, start, directions))
+    return lambda: fit(frames, start, directions).tip
+
+
+def _plain(count: int) -> tuple[World, list[Case], Tensor]:
+    """A world, ``count`` of its frames of a plain desk, four of them different, and their light [count, 3, H, W]."""
     world = World()
     seeds = [replace(world, seed=world.seed + seed) for seed in range(min(4, count))]
     plain = [next(case for case in conditions(each) if case.name == "plain") for each in seeds]
     frames = torch.stack([as_camera(case.frame()) for case in plain])
-    batch = frames.repeat(-(-count // len(frames)), 1, 1, 1)[:count].to(device)
-    track = tracker(world.camera, world.catheter, channels=ChannelOrder.RGB)
-    return lambda: torch.stack([pose.tip.detach().cpu() for pose in track(batch)])
+    return world, (plain * count)[:count], frames.repeat(-(-count // len(frames)), 1, 1, 1)[:count]

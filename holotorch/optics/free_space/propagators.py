@@ -16,7 +16,7 @@ from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
-from holotorch.core.tracing import constant_when_compiled
+from holotorch.core.tracing import constant_when_compiled, is_exporting
 from holotorch.optics.free_space.geometry import least_padding
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
 
@@ -143,19 +143,18 @@ class DistanceFilter(SpectralFilter):
             return self.transfer_function(field.dtype)
         if field.dtype == torch.complex64:
             return self.single_kernel
-        if torch.compiler.is_exporting():
+        if is_exporting():
             return self.transfer_function()
-        _keep_double_kernel(self)
+        self._keep_double_kernel()
         assert self.double_kernel is not None
         return self.double_kernel
 
-
-@constant_when_compiled
-def _keep_double_kernel(operator: DistanceFilter) -> None:
-    """Have the kernel for complex128; computed while torch.compile traces, not in each call of what it compiles."""
-    if operator.double_kernel is None:
-        with torch.inference_mode(False):  # a later call may need gradients
-            operator.double_kernel = operator.transfer_function()
+    @constant_when_compiled
+    def _keep_double_kernel(self) -> None:
+        """Have the kernel for complex128; torch.compile computes it when it traces, not in each call."""
+        if self.double_kernel is None:
+            with torch.inference_mode(False):  # a later call may need gradients
+                self.double_kernel = self.transfer_function()
 
 
 class _PaddedKernel(DistanceFilter):

@@ -15,7 +15,7 @@ from holotorch.core.learning import PreciseModule
 from holotorch.core.operator import Wavelengths
 from holotorch.core.precision import double
 from holotorch.core.quantities import DISTANCE
-from holotorch.core.tracing import constant_when_compiled
+from holotorch.core.tracing import constant_when_compiled, is_exporting
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel
 
 
@@ -103,11 +103,18 @@ class PupilViews(PreciseModule):
         """The transfer functions, complex [C, V, P, Q], in the dtype of ``field``."""
         if field.dtype == torch.complex64:
             return self.single_kernel
-        if torch.compiler.is_exporting():
+        if is_exporting():
             return self._kernel(field.device)
-        _keep_double_kernel(self, field.device)
+        self._keep_double_kernel(field.device)
         assert self.double_kernel is not None
         return self.double_kernel
+
+    @constant_when_compiled
+    def _keep_double_kernel(self, device: torch.device) -> None:
+        """Have the kernels for complex128; torch.compile computes them when it traces, not in each call."""
+        if self.double_kernel is None:
+            with torch.inference_mode(False):  # a later call may need gradients
+                self.double_kernel = self._kernel(device)
 
     def forward(self, field: Tensor) -> Tensor:
         """The fields of all views, complex [..., C, V, H, W], of ``field`` [..., C, H, W], same dtype."""
@@ -156,11 +163,3 @@ def view_kernel(padded: Grid, wavelength: Tensor, view: View, distance: float) -
     y, x = (wavelength[:, None, None] * f - sine for f, sine in zip((fy, fx), view.centre, strict=True))
     open_pupil = (y.square() + x.square() <= view.radius**2) & (y * view.covered[0] + x * view.covered[1] <= 0)
     return kernel * open_pupil
-
-
-@constant_when_compiled
-def _keep_double_kernel(views: PupilViews, device: torch.device) -> None:
-    """Have the kernels for complex128; computed while torch.compile traces, not in each call of what it compiles."""
-    if views.double_kernel is None:
-        with torch.inference_mode(False):  # a later call may need gradients
-            views.double_kernel = views._kernel(device)

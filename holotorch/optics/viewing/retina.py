@@ -15,7 +15,7 @@ from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.core.learning import PreciseModule
 from holotorch.core.quantities import WIDTH
-from holotorch.core.tracing import constant_when_compiled
+from holotorch.core.tracing import constant_when_compiled, is_exporting
 from holotorch.optics.viewing import imaging
 from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
@@ -324,6 +324,8 @@ class Retina(PreciseModule):
         self.adopt("display", display)
         self.adopt("eye", eye)
         self.plane, self.paraxial = plane, paraxial
+        lengths = [plane, *vars(display).values(), *vars(eye).values(), *eye.aberrations.values()]
+        self._fixed = not any(isinstance(each, Tensor) for each in lengths)
         self._factors: dict[tuple[torch.dtype, torch.device], list[imaging.CollapseFactors]] = {}
         self.plan = plan_retina(
             grid, self.wavelengths, display, eye, tolerance=tolerance, plane=plane, paraxial=paraxial, **options
@@ -356,12 +358,23 @@ class Retina(PreciseModule):
 
     def _constant_factors(self, like: Tensor) -> list[imaging.CollapseFactors] | None:
         """The factors of the collapse for fields as ``like``, kept from the first call; None for learned lengths."""
-        lengths = [self.plane, *vars(self.display).values(), *vars(self.eye).values(), *self.eye.aberrations.values()]
-        if torch.compiler.is_exporting() or any(isinstance(each, Tensor) for each in lengths):
+        if is_exporting() or not self._fixed:
             return None
         checks.field("field", like, (len(self.wavelengths), *self.grid.shape))
-        _keep_factors(self, like.dtype, like.device)
+        self._keep_factors(like.dtype, like.device)
         return self._factors[like.dtype, like.device]
+
+    @constant_when_compiled
+    def _keep_factors(self, dtype: torch.dtype, device: torch.device) -> None:
+        """Have the factors of the collapse; torch.compile computes them when it traces, not in each call."""
+        if (dtype, device) not in self._factors:
+            assert isinstance(self.plan.sampling, imaging.CollapseSampling)
+            plane = self.display.object_plane(self.plane, self.eye.accommodation)
+            setup = self.grid, self.wavelengths, self.display, self.eye, plane
+            like = torch.empty(0, dtype=dtype, device=device)
+            with torch.inference_mode(False), torch.no_grad():
+                factors = imaging.collapse_factors(like, *setup, self.plan.sampling, self.paraxial)
+            self._factors[dtype, device] = factors
 
     def forward(self, field: Tensor) -> Tensor:
         """Intensity on the retina, real [..., C, H, W]; its sum times the pitches is the power that arrives."""
@@ -370,19 +383,6 @@ class Retina(PreciseModule):
     def extra_repr(self) -> str:
         """Sampling and plan, for ``print(module)``."""
         return f"grid={self.grid}, wavelengths={self.wavelengths}, {self.plan.reason}"
-
-
-@constant_when_compiled
-def _keep_factors(retina: Retina, dtype: torch.dtype, device: torch.device) -> None:
-    """Have the factors of the collapse; computed while torch.compile traces, not in each call of what it compiles."""
-    if (dtype, device) not in retina._factors:
-        assert isinstance(retina.plan.sampling, imaging.CollapseSampling)
-        plane = retina.display.object_plane(retina.plane, retina.eye.accommodation)
-        setup = retina.grid, retina.wavelengths, retina.display, retina.eye, plane
-        like = torch.empty(0, dtype=dtype, device=device)
-        with torch.inference_mode(False), torch.no_grad():
-            factors = imaging.collapse_factors(like, *setup, retina.plan.sampling, retina.paraxial)
-        retina._factors[dtype, device] = factors
 
 
 def retinal_image(

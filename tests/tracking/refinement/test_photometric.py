@@ -6,6 +6,7 @@ from functools import cache, lru_cache
 import numpy as np
 import pytest
 import torch
+from paths import DEVICES
 
 from holotorch.tracking import Camera
 from holotorch.tracking.pose.catheter import THESIS
@@ -297,3 +298,18 @@ def test_an_edge_that_disagrees_is_noticed():
     frame, tip, direction = ray_shot(before=(rod,))
     found = PhotometricFit(SMALL.camera, THESIS, plan=FitPlan(readout=0.0))(frame, nudged(tip), direction)
     assert bool(found.tip.isnan().all()) or distance(found, tip) < 11.3
+
+
+@pytest.mark.skipif(not DEVICES[1:], reason="no CUDA device")
+def test_a_gpu_finds_the_same_poses_and_gradients():
+    shots = [shot(SMALL, name, SIMPLE) for name in ("here", "there")]
+    frames, tips, directions = (torch.cat(each) for each in zip(*shots, strict=True))
+    results = []
+    for device in DEVICES:
+        given = frames.double().div(255).to(device).requires_grad_()
+        fit = PhotometricFit(SMALL.camera, THESIS, learnable=True).to(device)
+        found = fit(given, nudged(tips).to(device), directions.to(device))
+        gradients = torch.autograd.grad(found.tip.sum(), (given, fit.positions, fit.radius))
+        results.append([value.detach().cpu() for value in (found.tip, found.direction, found.covariance, *gradients)])
+    for here, there in zip(*results, strict=True):
+        assert here.isfinite().all() and torch.allclose(here, there, rtol=1e-5, atol=1e-6 * here.abs().max().item())
