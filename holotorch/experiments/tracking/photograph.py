@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking.devices import build_catheter, load_catheter, save_catheter
@@ -23,6 +24,8 @@ GEOMETRY = "configs/tracking/catheter.yaml"  # whose edges, radius and length ar
 _AROUND = 2  # pixels to each side of a position that may count too
 _SURROUNDINGS = 6  # pixels to each side of a position; those on the border of this square are compared with the band
 _LIKE_BAND = 0.7  # of the largest difference from the surroundings: from here on, a pixel counts as one of the band
+_FEW = 4  # pixels: where fewer about a position look like the band, the position probably lies beside it
+_SHOWN, _TILE = 20, 240  # pixels: the picture shows so many to each side of a place, in squares of so many
 _UNEVEN = 25  # levels: deviation within a box above which it probably holds more than one band
 _BRIGHT = 250  # level from which on a channel is probably saturated
 _STAND_INS = ((200, 40, 45), (40, 70, 190))  # colours of neighbouring bands until theirs are read
@@ -66,7 +69,10 @@ def calibrate_catheter(
     boxes = _boxes(places, len(tool.colours), pixels.shape[-2:])
     if out.exists():
         raise ConfigError([f"{out} exists already; choose another --out or delete it"])
-    levels, spread = zip(*(_colour(pixels, box) for box in boxes), strict=True)
+    picture = out.with_name(f"{out.stem}-bands.png")
+    if picture.exists():
+        raise ConfigError([f"{picture} exists already; choose another --out or delete it"])
+    levels, spread, counts = zip(*(_colour(pixels, box) for box in boxes), strict=True)
     camera = Camera(torch.eye(3, dtype=torch.float64), torch.zeros(5, dtype=torch.float64))  # of the tone sRGB
     try:
         catheter = replace(tool, colours=levels)
@@ -77,9 +83,11 @@ def calibrate_catheter(
         raise ConfigError([f"{photograph}: {error}; found {listed}: {advice}"]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
     save_catheter(out, catheter)
+    write_bytes(picture, encode_png(_places_shown(pixels, boxes, levels) / 255))
     lines = [
-        f"Band {i}     [{', '.join(map(str, level))}] at {place}, deviation {deviation:.0f} levels"
-        for i, (level, place, deviation) in enumerate(zip(levels, places, spread, strict=True), 1)
+        f"Band {i}     [{', '.join(map(str, level))}] at {place}, median of {count} pixels, which deviate by "
+        f"{deviation:.0f} levels"
+        for i, (level, place, deviation, count) in enumerate(zip(levels, places, spread, counts, strict=True), 1)
     ]
     edges = ", ".join(f"{1e3 * edge:g}" for edge in tool.edges)
     kept = [key for key in ("edges", "radius", "length") if key not in measured]
@@ -87,19 +95,39 @@ def calibrate_catheter(
         f"Geometry   edges at {edges} mm from the tip, radius {1e3 * tool.radius:g} mm, length {1e3 * tool.length:g} mm"
         + (f"; {' and '.join(kept)} of {source}: measure yours and give --{' --'.join(kept)}" if kept else "")
     )
+    notes = _notes(places, boxes, levels, spread, counts)
+    if doubt := ambiguity_text(ambiguities(camera, catheter)):
+        notes.append(doubt)
+    shown = (
+        f"Picture    {picture}: around each place, in a frame the pixels that may count, below the colour that was read"
+    )
+    return catheter, [*lines, shown, *(f"Note       {note}" for note in notes)]
+
+
+def _notes(
+    places: Sequence[str],
+    boxes: Sequence[tuple[int, int, int, int]],
+    levels: Sequence[tuple[int, int, int]],
+    spread: Sequence[float],
+    counts: Sequence[int],
+) -> list[str]:
+    """What makes a band's colour doubtful: its place, or its light."""
     notes = [
         f"band {i} varies much within {place}: choose a box that holds this band alone, or a position X,Y on it"
         for i, (place, deviation) in enumerate(zip(places, spread, strict=True), 1)
         if deviation > _UNEVEN
     ]
     notes += [
+        f"band {i}: only {count} of the pixels about {place} look like a band; is the position on its middle?"
+        for i, (place, count, (x0, y0, x1, y1)) in enumerate(zip(places, counts, boxes, strict=True), 1)
+        if count < _FEW and (x0, y0) == (x1, y1)
+    ]
+    notes += [
         f"band {i} is overexposed: its hue is not known; use a shorter exposure"
         for i, level in enumerate(levels, 1)
         if max(level) >= _BRIGHT
     ]
-    if doubt := ambiguity_text(ambiguities(camera, catheter)):
-        notes.append(doubt)
-    return catheter, [*lines, *(f"Note       {note}" for note in notes)]
+    return notes
 
 
 def save_first_frame(video: Path, out: Path) -> str:
@@ -148,15 +176,36 @@ def _boxes(places: Sequence[str], bands: int, size: Sequence[int]) -> list[tuple
     return boxes
 
 
-def _colour(pixels: torch.Tensor, box: tuple[int, int, int, int]) -> tuple[tuple[int, int, int], float]:
-    """Median colour within a box or about a position, and the largest standard deviation of its channels, in levels."""
+def _places_shown(
+    pixels: torch.Tensor, boxes: Sequence[tuple[int, int, int, int]], levels: Sequence[tuple[int, int, int]]
+) -> torch.Tensor:
+    """Levels [3, H, W] of a picture: the surroundings of each box, enlarged, with a frame, above the colour read."""
+    tiles = []
+    for (x0, y0, x1, y1), level in zip(boxes, levels, strict=True):
+        margin = _AROUND if (x0, y0) == (x1, y1) else 0
+        half = max(_SHOWN, x1 - x0, y1 - y0)
+        left, top = (x0 + x1) // 2 - half, (y0 + y1) // 2 - half
+        around = functional.pad(pixels.double(), (half, half, half, half))
+        around = around[:, top + half : top + 3 * half + 1, left + half : left + 3 * half + 1].clone()
+        frame = torch.zeros(around.shape[1:], dtype=torch.bool)
+        frame[y0 - top - margin - 1 : y1 - top + margin + 2, x0 - left - margin - 1 : x1 - left + margin + 2] = True
+        frame[y0 - top - margin : y1 - top + margin + 1, x0 - left - margin : x1 - left + margin + 1] = False
+        around[:, frame] = 255.0 if around.mean() < 128 else 0.0
+        colour = torch.tensor(level, dtype=torch.float64)[:, None, None].expand(3, _TILE // 4, _TILE)
+        tile = torch.cat([functional.interpolate(around[None], (_TILE, _TILE))[0], colour], 1)
+        tiles.append(functional.pad(tile, (2, 2, 2, 2), value=255.0))
+    return torch.cat(tiles, 2)
+
+
+def _colour(pixels: torch.Tensor, box: tuple[int, int, int, int]) -> tuple[tuple[int, int, int], float, int]:
+    """Median colour within a box or about a position, the largest deviation of its channels, number of pixels."""
     x0, y0, x1, y1 = box
     if (x0, y0) == (x1, y1):
         inside = _like_band(pixels, x0, y0)
     else:
         inside = pixels[:, y0 : y1 + 1, x0 : x1 + 1].flatten(1).numpy().astype(np.float64)
     red, green, blue = (int(value) for value in np.median(inside, 1).round())
-    return (red, green, blue), float(inside.std(1).max())
+    return (red, green, blue), float(inside.std(1).max()), inside.shape[1]
 
 
 def _like_band(pixels: torch.Tensor, x: int, y: int) -> np.ndarray:

@@ -65,6 +65,9 @@ def test_a_box_counts_its_median_and_keeps_the_geometry_of_a_file(capsys):
     assert tool.edges == (0.02, 0.04, 0.05, 0.06) and tool.radius == 8e-4
     assert "band 1 varies much within 0,20,19,29" in out and "band 2 varies" not in out
     assert "band 3 is overexposed" in out and "band 1 is overexposed" not in out
+    shown = cv2.imread("new/mine-bands.png")
+    assert shown is not None and shown.shape == (304, 732, 3)
+    assert [tuple(shown[-10, x].tolist()[::-1]) for x in (122, 366, 610)] == [*tool.colours]
     assert main(["calibrate", "catheter", "bands.png", *words]) == 2
     assert "new/mine.yaml exists already" in capsys.readouterr().err
 
@@ -79,10 +82,23 @@ def test_a_position_on_a_thin_tube_gives_its_colour_and_not_that_of_its_surround
     cv2.imwrite("bands.png", np.ascontiguousarray(picture[..., ::-1]))
     assert main(["calibrate", "catheter", "bands.png", "--bands", "15,31", "45,30", "75,30"]) == 0
     assert build_catheter(load_catheter("catheter.yaml")).colours == colours
-    assert "varies much" not in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "varies much" not in out and "look like a band" not in out
     boxes = ["13,28,17,34", "43,28,47,34", "73,28,77,34"]
     assert main(["calibrate", "catheter", "bands.png", "--out", "boxes.yaml", "--bands", *boxes]) == 2
     assert "found 13,28,17,34: [90, 110, 150]" in capsys.readouterr().err
+
+
+def test_a_position_beside_a_band_is_noted(capsys):
+    picture = np.full((60, 90, 3), 120, np.uint8)
+    for i, colour in enumerate(((200, 60, 40), (40, 160, 70), (50, 60, 190))):
+        picture[28:33, 30 * i : 30 * i + 30] = colour[::-1]
+    picture[34, 44] = (80, 140, 60)  # one pixel of light that is neither
+    cv2.imwrite("bands.png", picture)
+    assert main(["calibrate", "catheter", "bands.png", "--bands", "15,30", "45,36", "75,30"]) == 0
+    out = capsys.readouterr().out
+    assert "band 2: only 1 of the pixels about 45,36 look like a band" in out and "band 1: only" not in out
+    assert "catheter-bands.png" in out
 
 
 def test_lengths_are_given_with_the_photograph(capsys):
