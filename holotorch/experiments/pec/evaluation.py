@@ -25,12 +25,14 @@ class Result:
     Attributes:
         phase: Heater phases in rad, [F, C, H, W] for F frames, as the solver gives them.
         picture: Intensity at the pixels of the target, scaled to the values of the target, float64 [C, h, w].
+        between: The same midway between four samples, of a single chip in the near field.
         isolated: ``picture`` of a single chip, without periodic repetition; None in the far field.
         numbers: Entry of summary.json for the method.
     """
 
     phase: Tensor
     picture: Tensor
+    between: Tensor
     isolated: Tensor | None
     numbers: dict[str, Any]
 
@@ -78,10 +80,11 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
         between = experiment.picture_in(between).cpu()
         if experiment.scale_free:
             between = between * _scale(experiment, formed)
+    between = _as_picture(experiment, between, at_best_scale=False)
     numbers["between_samples"] = _between_scores(experiment, between)
     if weight := experiment.settings.target.weight:
         numbers["zones"] = zone_scores(weight, picture, experiment.image, experiment.lit)
-    return Result(_all_colours(experiment, phase.cpu()), picture, isolated, numbers)
+    return Result(_all_colours(experiment, phase.cpu()), picture, between, isolated, numbers)
 
 
 def with_noisy_kernels(experiment: PECExperiment, phase: Tensor, noise: float) -> dict[str, Any]:
@@ -161,8 +164,8 @@ def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[st
 
 
 def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any]:
-    """Scores of the intensity midway between four samples, against the mean of the four pixels of the target."""
-    picture = _as_picture(experiment, between, at_best_scale=False)[..., :-1, :-1]
+    """Scores of the picture midway between four samples, against the mean of the four pixels of the target."""
+    picture = between[..., :-1, :-1]
     image = experiment.image
     reference = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
     return _scores(experiment, picture, reference) if min(reference.shape[-2:]) >= SSIM_WINDOW else {}

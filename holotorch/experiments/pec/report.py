@@ -18,7 +18,8 @@ METHOD_NAMES = {
     "corrected": "Corrected",
 }
 ISOLATED_NAME = "Corrected, on a chip that stands alone"
-_PICTURES = {"target": "Target", **METHOD_NAMES, "isolated": ISOLATED_NAME}
+BETWEEN_NAME = "Corrected, midway between the samples"
+_PICTURES = {"target": "Target", **METHOD_NAMES, "between": BETWEEN_NAME, "isolated": ISOLATED_NAME}
 _POOR = 0.8  # SSIM of a corrected picture below which more frames are advised
 _FIGURES = {
     "phase": "Heater phases, before the heat spreads{frame}",
@@ -40,7 +41,9 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
                 f"{name} {_fixed(value, digits)}{unit}" + (f" ({without} without correction)" if without else "")
             )
     if (between := corrected.get("between_samples", {}).get("ssim_mean")) is not None:
-        scores.append(f"SSIM {_fixed(between, 3)} midway between the samples, which a viewer sees as well")
+        scores.append(
+            f"SSIM {_fixed(between, 3)} midway between the samples (between.png), which a viewer sees as well"
+        )
     scores.append(f"hottest pixel {max(corrected['peak_temperature_rise_K']):.0f} degC above ambient")
     noise = [f"Kernel     {_with_noise(numbers)}"] if (numbers := corrected.get("kernel_noise")) else []
     advice = []
@@ -150,7 +153,8 @@ def _zone_cell(zone: dict[str, Any]) -> str:
 
 def _score(run: RunRecord, name: str) -> str:
     methods = run.summary["methods"]
-    value = (methods["corrected"] if name == "isolated" else methods).get(name, {}).get("ssim_mean")
+    own = {"between": "between_samples", "isolated": "isolated"}.get(name)
+    value = (methods["corrected"].get(own, {}) if own else methods.get(name, {})).get("ssim_mean")
     return "" if value is None else f": SSIM {value:.3f}"
 
 

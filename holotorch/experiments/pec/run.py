@@ -14,7 +14,7 @@ from holotorch.experiments.pec.evaluation import Result, evaluate, speckle_spots
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.measured import pec_errors
 from holotorch.experiments.pec.progress import Log
-from holotorch.experiments.pec.report import ISOLATED_NAME, METHOD_NAMES
+from holotorch.experiments.pec.report import BETWEEN_NAME, ISOLATED_NAME, METHOD_NAMES
 from holotorch.experiments.pec.weight import ZONES, eccentricities, weight_map
 from holotorch.experiments.planning.errors import measured_values
 from holotorch.experiments.runs import figures
@@ -145,6 +145,8 @@ def _write_results(
     files.write(save_array, out / "arrays" / "target.npy", experiment.image)
     shown = {"target": experiment.image} | {name: results[name].picture for name in METHOD_NAMES if name in results}
     captions = ["Target", *(METHOD_NAMES[name] + _score(results[name].numbers) for name in shown if name in results)]
+    shown["between"] = corrected.between
+    captions.append(BETWEEN_NAME + _score(corrected.numbers["between_samples"]))
     if corrected.isolated is not None and not experiment.isolated:
         shown["isolated"] = corrected.isolated
         captions.append(ISOLATED_NAME + _score(corrected.numbers["isolated"]))
