@@ -180,9 +180,9 @@ def verdict(summary: dict[str, Any]) -> str:
 
 
 def refusals(summary: dict[str, Any]) -> list[str]:
-    """The common refusals and what to look at, if a quarter of the frames or more have no pose."""
+    """The common refusals and what to look at, if one frame in fifty or more has no pose."""
     refused = summary.get("refused")  # none in runs of before
-    if not refused or 4 * summary["answered"] > 3 * summary["frames"]:
+    if not refused or 50 * (summary["frames"] - summary["answered"]) < summary["frames"]:
         return []
     common = [each for each in refused if 2 * each["frames"] >= refused[0]["frames"]]
     return [f"Refused    {each['frames']} like {each['first']}; {_ADVICE[Status[each['status']]]}" for each in common]
