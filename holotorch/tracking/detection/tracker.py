@@ -495,13 +495,12 @@ class CatheterTracker(nn.Module):
             absent |= number == crossed
         if not absent.any():
             return edges
-        rest = dataclasses.replace(
-            edges, t=np.where(absent, np.nan, edges.t), deviation=np.where(absent, np.inf, edges.deviation)
-        )
+        rest = _without(edges, absent)
         if np.isfinite(rest.t).sum() > 2:
             expected = self._expected_edges(self._solved(axis, rest, rough=True), axis.line)
             if crossed is not None and abs(expected[crossed] - edges.t[crossed]) < _NEAR:
-                return edges
+                absent[crossed] = False  # measured again, in its own place
+                rest = _without(edges, absent)
             if all(self._crossed(sampler, axis, rest.t, float(expected[index])) for index in absent.nonzero()[0]):
                 return rest
         raise _unexplained(absent)
@@ -656,6 +655,12 @@ class CatheterTracker(nn.Module):
             yield
         finally:
             self.times[stage] += time.perf_counter() - began
+
+
+def _without(edges: Edges, absent: np.ndarray) -> Edges:
+    """The edges without those that are ``absent`` [N]."""
+    t, deviation = np.where(absent, np.nan, edges.t), np.where(absent, np.inf, edges.deviation)
+    return dataclasses.replace(edges, t=t, deviation=deviation)
 
 
 def _unexplained(absent: np.ndarray) -> Refusal:
