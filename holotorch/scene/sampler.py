@@ -63,7 +63,8 @@ class DVRSampler(nn.Module):
         distance: Distance of the centre of the volume from the hologram in metres; by default half-way between the
             first and the last plane.
         rotation: Rotation matrix about the centre of the volume, [3, 3] over (z, y, x): offset in the scene = rotation
-            @ offset in the volume. By default slice 0 of the volume is nearest to the hologram.
+            @ offset in the volume. By default slice 0 of the volume is nearest to the hologram. An observer on the far
+            side (falling depths) sees the mirror image of a right-handed volume: give him ``volume.mirrored()``.
         eye: Depth of the observer in metres, in front of all slabs; negative if the hologram is between observer and
             volume. None for an observer at infinity.
         lighting: Shading by the gradient of the volume, or light that it scatters; None for emission without shading.

@@ -76,6 +76,19 @@ class Volume:
         (depth, height, width), (z, y, x) = self.shape, self.spacing
         return depth * z, height * y, width * x
 
+    @property
+    def left_handed(self) -> bool:
+        """Whether the axes x, y, z of the voxels form a left-handed frame in the coordinates of the file."""
+        return torch.linalg.det(torch.tensor(self.orientation, dtype=torch.float64)).item() < 0
+
+    def mirrored(self) -> "Volume":
+        """A copy with the voxels in reverse order along x; origin and orientation still say where they are."""
+        z, y, (a, b, c) = self.orientation
+        last = (self.shape[2] - 1) * self.spacing[2]
+        origin = self.origin[0] + last * a, self.origin[1] + last * b, self.origin[2] + last * c
+        values = torch.from_numpy(self.values.numpy(force=True)[..., ::-1].copy())  # torch flips no uint16
+        return Volume(values.to(self.values.device), self.spacing, self.unit, origin, (z, y, (-a, -b, -c)))
+
     def value_range(self) -> tuple[float, float]:
         """Smallest and largest value; ValueError if a value is NaN or infinite."""
         ends = torch.stack([torch.stack(slab.aminmax()).to(torch.float64) for _, slab in self._slabs()])

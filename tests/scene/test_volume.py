@@ -120,3 +120,15 @@ def test_bricks_of_one_voxel_and_of_learnable_values():
     assert volume.value_range() == (3.0, 3.0) and volume.extent == (1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="brick size must be at least 1, got 0"):
         volume.bricks(0)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_a_mirrored_volume_has_each_voxel_where_it_was(dtype):
+    volume = Volume(filled(dtype), (3e-3, 1e-3, 2e-3), "m", (0.1, 0.2, 0.3), SIDE)
+    mirrored = volume.mirrored()
+    assert not volume.left_handed and mirrored.left_handed
+    assert torch.equal(mirrored.values, torch.from_numpy(volume.values.numpy()[..., ::-1].copy()))
+    for one, index in ((volume, 0), (mirrored, 22)):
+        place = np.array(one.origin) + index * one.spacing[2] * np.array(one.orientation[2])
+        np.testing.assert_allclose(place, volume.origin, atol=1e-12)
+    assert torch.equal(mirrored.mirrored().values, volume.values)

@@ -51,6 +51,8 @@ class VolumeSource(Settings):
 
     If both a scene and a phantom are given, the phantom is used only if the scene cannot be fetched. ``spacing``
     (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` supply what a file does not state; see ``load_volume``.
+    ``left_handed``: the axes x, y, z of a file that does not say where they point form a left-handed frame, as of a
+    stack of slices in the other order.
     ``directory`` is the cache of fetched scenes.
     """
 
@@ -63,6 +65,7 @@ class VolumeSource(Settings):
     shape: tuple[Count, Count, Count] | None = None
     dtype: Annotated[str, BeforeValidator(_number_type)] | None = None
     unit: Literal["m", "relative"] | None = None
+    left_handed: bool = False
 
 
 class TransferSettings(Settings):
@@ -92,7 +95,9 @@ class TransferSettings(Settings):
 
 
 class ScatteringSettings(Settings):
-    """Light that the volume scatters once, see ``holotorch.scene.Scattering``; the light comes from ``towards``.
+    """Light that the volume scatters once, see ``holotorch.scene.Scattering``.
+
+    ``towards`` is the direction (z, y, x) to the light, with z away from the observer, y downwards and x to the right.
 
     ``half_angle_deg``: angle between the middle and the edge of the light. ``samples``: number of random directions.
     """
@@ -112,8 +117,9 @@ class ViewSettings(Settings):
     slices upright. The volume is then rotated by ``azimuth_deg`` about the vertical axis, and by ``elevation_deg``
     about the horizontal axis (x). ``width`` is the length of its longest side in metres, by default the longest side of
     the hologram.
-    ``front`` says which end of the volume faces the observer. ``lighting`` shades points by the gradient of the volume;
-    ``scattering`` in its place gives the volume shadows.
+    ``front`` says which end of the volume faces the observer: the one far from the hologram, for a display that forms
+    the scene in front of it, or the near one. Either observer sees the volume as it was scanned, not its mirror image.
+    ``lighting`` shades points by the gradient of the volume; ``scattering`` in its place gives the volume shadows.
     ``adaptive``: follow all rays only where colours or opacity of every fourth ray differ by more than this.
     """
 

@@ -31,7 +31,7 @@ from holotorch.scene.lighting import Lighting, Scattering
 from holotorch.scene.phases import PointPhases, point_phases, random_phase, smooth_phase
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.transfer import TransferFunction
-from holotorch.scene.volume import Volume
+from holotorch.scene.volume import Triple, Volume
 
 _CATALOGUE = {"teapot": "boston_teapot"}  # names of the thesis that differ from those of the catalogue
 _COUNTED = 1_000_000  # largest number of voxels in the histogram
@@ -105,11 +105,15 @@ class VolumeExperiment:
     def rotation(self) -> Tensor:
         """Rotation matrix of the volume about its middle, for vectors (z, y, x)."""
         view = self.settings.view
-        a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
+        a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg) * (1 if view.front == "far" else -1)
         about_y = ((math.cos(a), 0, math.sin(a)), (0, 1, 0), (-math.sin(a), 0, math.cos(a)))
         about_x = ((math.cos(e), -math.sin(e), 0), (math.sin(e), math.cos(e), 0), (0, 0, 1))
         x, y, standing = (torch.tensor(rows, dtype=torch.float64) for rows in (about_x, about_y, _STANDING[view.up]))
-        return (x @ y @ standing).round(decimals=15)
+        rotation = x @ y @ standing
+        if view.front == "far":  # of the mirrored volume, see _as_seen
+            mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+            rotation = mirror[:, None] * rotation * mirror
+        return rotation.round(decimals=15)
 
     @cached_property
     def depths(self) -> tuple[float, ...]:
@@ -236,10 +240,17 @@ class VolumeExperiment:
             return sampler.render(self.volume)[0][: len(self.settings.wavelengths)].cpu()
 
     def _lighting(self) -> Lighting | Scattering | None:
-        if (light := self.settings.view.scattering) is not None:
+        view = self.settings.view
+        if (light := view.scattering) is not None:
             strengths = {name: getattr(light, name) for name in ("ambient", "strength", "anisotropy", "samples")}
-            return Scattering(light.towards, math.radians(light.half_angle_deg), seed=self.settings.seed, **strengths)
-        return Lighting() if self.settings.view.lighting else None
+            towards, half_angle = self._in_scene(light.towards), math.radians(light.half_angle_deg)
+            return Scattering(towards, half_angle, seed=self.settings.seed, **strengths)
+        return Lighting(self._in_scene(Lighting.towards)) if view.lighting else None
+
+    def _in_scene(self, towards: Triple) -> Triple:
+        """A direction (z, y, x) with z away from the observer, as one with z away from the hologram."""
+        z, y, x = towards
+        return (-z if self.settings.view.front == "far" else z), y, x
 
     def layers(self, seed: int = 0) -> SourceLayers:
         """The light sources of the planes with the random phases of a realisation."""
@@ -317,6 +328,7 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     volume, synthetic = open_volume(settings.volume)
     try:
         volume.check_finite()
+        volume = _as_seen(volume, settings.view.front)
         device = find_device(settings.device)
         volume = replace(volume, values=volume.values.to(device))
         experiment = VolumeExperiment(settings, volume, synthetic, device)
@@ -336,15 +348,29 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     return experiment
 
 
+def _as_seen(volume: Volume, front: str) -> Volume:
+    """The volume, mirrored along x where its observer would see the mirror image of what was scanned.
+
+    The columns of every picture go to the right and its rows downwards. From the hologram's side, depths go away from
+    the observer: these three form a right-handed frame, and from the far side a left-handed one. The voxels of a file
+    may have either.
+    """
+    return volume if volume.left_handed == (front == "far") else volume.mirrored()
+
+
 def open_volume(source: VolumeSource) -> tuple[Volume, str]:
     """The volume, and the reason why it is a phantom, "" for real data. ConfigError if it cannot be read."""
     spacing = source.spacing[0] if source.spacing and len(source.spacing) == 1 else source.spacing
     try:
         if source.path:
             options = {"spacing": spacing, "shape": source.shape, "dtype": source.dtype, "unit": source.unit}
-            return load_volume(source.path, **options), ""
+            volume = load_volume(source.path, **options)
+            z, y, (a, b, c) = volume.orientation
+            return replace(volume, orientation=(z, y, (-a, -b, -c))) if source.left_handed else volume, ""
     except ValueError as error:
         raise ConfigError([f"volume: {_as_settings(str(error))}"]) from error
+    except ImportError as error:
+        raise ConfigError([f"volume.path: {source.path}: {error}"]) from error
     except OSError as error:
         raise ConfigError([f"volume.path: {source.path}: {error.strerror or error}"]) from error
     reason = "a phantom was asked for"

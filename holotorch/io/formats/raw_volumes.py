@@ -156,6 +156,8 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     scale = np.array([scan.metres(unit, path) for unit in units] if units else [1.0, 1, 1])
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
+    if header.get("space", "").lower() in ("left-anterior-superior", "las", "3d-left-handed"):
+        axes, origin = axes * (-1.0, 1, 1), origin * (-1.0, 1, 1)
     return scan.placed(values, axes * scale, origin, "m" if units else "relative")
 
 
