@@ -169,6 +169,7 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
 
 _SAME_ASPECT = 0.01  # relative change of an aspect ratio that nobody sees
 _WARM = 0.02  # mean rise along a side of a measured kernel, relative to its centre, above which heat is missing
+_LITTLE = 1.0  # rad: of random phases that differ by less, over 0.9 of the light goes straight on (sinc^2(1/2))
 _NO_GAUSSIAN = 0.05  # rest of a fit above which corrections for the Gaussian lose much of their gain
 
 
@@ -212,7 +213,8 @@ def _heat(experiment: PECExperiment) -> str:
     limit, bits = experiment.limit, experiment.settings.modulator.bits
     chip = experiment.settings.modulator
     steps = "" if bits is None else f"; heaters with {2**bits} steps"
-    steps += f"; modulator.rad_per_K={chip.rad_per_K:.4g} at 630 nm"
+    thesis = ", the thesis's chip" if chip.rad_per_K == type(chip).model_fields["rad_per_K"].default else ""
+    steps += f"; modulator.rad_per_K={chip.rad_per_K:.4g} at 630 nm{thesis}"
     if limit is None:
         return "no limit, as in the thesis: the hottest pixel is reported" + steps
     kelvin = [limit / response for response in experiment.array.response]
@@ -242,6 +244,11 @@ def _notes(experiment: PECExperiment) -> list[str]:
     """Warnings about the limits of the model."""
     notes = []
     grid, distances, longest = experiment.grid, experiment.distances, max(experiment.wavelengths)
+    if experiment.limit is not None and experiment.limit < _LITTLE:
+        notes.append(
+            f"the limit lets phases differ by {experiment.limit:.3g} rad at most, which steers little light: no solver "
+            "and no number of frames makes a good picture of that"
+        )
     if distances:
         limit, farthest = unaliased_distance(grid, longest, 1), max(map(abs, distances))
         if min(distances) < 0:

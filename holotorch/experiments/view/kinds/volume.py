@@ -73,9 +73,11 @@ class VolumeViewer(Viewer):
             ),
             *turning_controls(experiment),
         ]  # fmt: skip
+        seeds = experiment.settings.report.seeds
+        one = f", one of the run's {seeds} realisations of the phases," if seeds > 1 else ""
         self.note = (
-            "The stored hologram is propagated exactly. Each colour is scaled to fit the rendering best, and averaged "
-            "over the pixels of each ray. A turned volume has a new hologram of at most "
+            f"The stored hologram{one} is propagated exactly. Each colour is scaled to fit the rendering best, and "
+            "averaged over the pixels of each ray. A turned volume has a new hologram of at most "
             f"{_FINE} pixels a side, and one of {_COARSE} while it moves."
         )
 
