@@ -368,16 +368,18 @@ def deconvolved(crosstalk: ThermalCrosstalk, phase: Tensor) -> Tensor:
     return deconvolve(crosstalk, phase % (2 * math.pi) + math.pi)
 
 
+def with_planes(scene: VolumeExperiment, settings: JointSettings, count: int) -> VolumeExperiment:
+    """The scene of a run on ``count`` planes."""
+    return replace(scene, settings=VolumeSettings.model_validate(volume_settings(settings, count)))
+
+
 def build(settings: JointSettings) -> JointExperiment:
     """Load the inputs. ConfigError for a volume, transfer function or heat kernel that cannot be read or used."""
     scene = build_volume(VolumeSettings.model_validate(volume_settings(settings)))
 
-    def with_planes(count: int) -> VolumeExperiment:
-        return replace(scene, settings=VolumeSettings.model_validate(volume_settings(settings, count)))
-
     def slab_error(count: int) -> float:
-        return with_planes(count).sampler().slab_error(scene.volume)
+        return with_planes(scene, settings, count).sampler().slab_error(scene.volume)
 
-    experiment = JointExperiment(settings, with_planes(shares.choose_planes(settings, slab_error)))
+    experiment = JointExperiment(settings, with_planes(scene, settings, shares.choose_planes(settings, slab_error)))
     _ = experiment.crosstalk  # read now, so that its errors are reported
     return experiment

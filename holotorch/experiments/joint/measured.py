@@ -10,14 +10,12 @@ from torch import Tensor
 from holotorch.core.complex import phasor
 from holotorch.correction import Solution
 from holotorch.experiments.joint.budget import PATIENCE, SLABS
-from holotorch.experiments.joint.config import volume_settings
-from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.methods import Shown, show
 from holotorch.experiments.joint.seconds import shown_seconds, step_seconds
 from holotorch.experiments.planning.correction import HEAT, PROPAGATION, STOPPING, scaled_error, spread_completely
 from holotorch.experiments.planning.errors import LIMIT, Comparison, not_measured
 from holotorch.experiments.planning.machine import Machine, machine_speed
-from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.measured import relative_error
 from holotorch.experiments.volume.plan import rendering_seconds
 from holotorch.modulator import ThermalCrosstalk
@@ -82,7 +80,7 @@ def _propagation(experiment: JointExperiment, solution: Solution) -> tuple[float
 def _planes(experiment: JointExperiment, _: Solution) -> tuple[float, str]:
     """Error of the rendering along the axis."""
     scene, count = experiment.scene, _THINNER * len(experiment.depths)
-    thin = replace(scene, settings=VolumeSettings.model_validate(volume_settings(experiment.settings, count)))
+    thin = with_planes(scene, experiment.settings, count)
     with torch.no_grad():
         pictures: list[Tensor] = [each.sampler().render(scene.volume)[0] for each in (scene, thin)]
     error = relative_error(*pictures) / math.sqrt(1 - _THINNER**-2)

@@ -7,11 +7,11 @@ import torch
 
 from holotorch.experiments.joint.budget import COARSE_PLANES, PATIENCE, SLABS, stop
 from holotorch.experiments.joint.config import REFERENCE, JointSettings
-from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
-from holotorch.experiments.volume.plan import dark_picture
+from holotorch.experiments.volume.plan import dark_picture, seen_from
 from holotorch.optics.light.coherence import depth_of_focus
 
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
@@ -56,7 +56,9 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     source = settings.volume.path or settings.volume.scene or settings.volume.phantom
     if volume["synthetic"]:
         source = f"{settings.volume.phantom} (synthetic: {volume['synthetic']})"
-    stretched = f", stretched {values['stretched']:.3g} times along the axis" if display.depth is not None else ""
+    stretched = ""
+    if display.depth is not None:
+        stretched = f", stretched {values['stretched']:.3g} times along the axis to fill display.depth"
     heat = settings.heat
     spread = f"heat spreads over {display.sigma_px:g} px"
     if display.kernel is not None:
@@ -66,6 +68,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, on {len(values['foci_mm'])} planes from "
         f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
+        f"View       {seen_from(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient{memory}",
@@ -100,16 +103,28 @@ def _left(settings: JointSettings) -> float:
     return math.exp(-settings.heat.frame_us / settings.heat.time_constant_us)
 
 
+def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
+    """The least of 2, 4 and 8 times as many planes that are close enough to the volume, else 8 times, and its error."""
+    count, error = len(experiment.foci), math.inf
+    for factor in (2, 4, 8):
+        if error > COARSE_PLANES:
+            count = factor * len(experiment.foci)
+            more = with_planes(experiment.scene, experiment.settings, count)
+            error = more.sampler().slab_error(more.volume)
+    return count, error
+
+
 def _notes(experiment: JointExperiment) -> list[str]:
     settings, foci = experiment.settings, experiment.foci
     notes = dark_picture(experiment.scene)
     if (error := experiment.budget.error(SLABS)) > COARSE_PLANES:
-        more = 2 * len(foci)
+        more, left = _more_planes(experiment)
         # The comparison "slabs" shows one plane in each frame.
         more_frames = f" frames={more}" if "slabs" in settings.report.baselines else ""
+        still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
         notes.append(
             f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show "
-            f"slices of it; more planes, such as display.planes={more}{more_frames}, come closer"
+            f"slices of it; display.planes={more}{more_frames} would be {left:.0%} off{still}"
         )
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
     if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:

@@ -163,7 +163,7 @@ _ADVICE = {
     Status.OUT_OF_FRAME: "the bands must lie within the picture",
     Status.OUTSIDE_CAMERA: "the camera's file says nothing there: calibrate with boards near the picture's edges",
     Status.INCONSISTENT: "no pose explains what was measured: are `edges`, `radius` (half the thickness) and camera "
-    "right, and all bands free?",
+    "right, the bands named from the tip on, and all of them free?",
     Status.UNCERTAIN: _LONGER,
 }
 
@@ -185,7 +185,11 @@ def refusals(summary: dict[str, Any]) -> list[str]:
     if not refused or 50 * (summary["frames"] - summary["answered"]) < summary["frames"]:
         return []
     common = [each for each in refused if 2 * each["frames"] >= refused[0]["frames"]]
-    return [f"Refused    {each['frames']} like {each['first']}; {_ADVICE[Status[each['status']]]}" for each in common]
+    lines = [f"Refused    {each['frames']} like {each['first']}; {_ADVICE[Status[each['status']]]}" for each in common]
+    wrong = summary.get("statuses", {}).get(Status.INCONSISTENT.name, 0)
+    if summary["answered"] and wrong > 3 * summary["answered"]:
+        lines.append(f"Warning    the {summary['answered']} poses beside so many contradictions may be wrong, too")
+    return lines
 
 
 def save_figure(folder: Path, log: Log) -> None:

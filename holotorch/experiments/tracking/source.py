@@ -60,7 +60,7 @@ def open_inputs(
             paths[f"{name}.yaml"] = beside
         else:
             here = f", such as --{name} {name}.yaml" if Path(f"{name}.yaml").is_file() else ""
-            missing.append(f"no {name}.yaml: say which with --{name}{here}, or {name}: in a configuration")
+            missing.append(f"no {name} is given: say which with --{name}{here}, or {name}: in a configuration")
     if missing:
         raise ConfigError(missing)
     lens, tool = _loaded(paths)

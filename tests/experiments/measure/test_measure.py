@@ -118,7 +118,7 @@ def test_clocks_that_differ_are_said(tmp_path, capsys):
         (["grid2d", "poses.csv", "--delay", "50"], "delay: it belongs to the protocol prediction, got grid2d"),
         (["still", "poses.csv", "--resting"], "resting: it belongs to the protocol edges, got still"),
         (["still", "--print", "a.svg"], "--print writes the sheet of grid2d"),
-        (["still", "pictures"], "no camera.yaml: say which with --camera"),
+        (["still", "pictures"], "no camera is given: say which with --camera"),
     ],
 )
 def test_mistakes_are_said(words, message, tmp_path, monkeypatch, capsys):

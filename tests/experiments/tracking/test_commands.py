@@ -166,8 +166,8 @@ def test_track_hands_its_arguments_on(monkeypatch):
 def test_track_without_a_camera_or_a_catheter_asks_for_them(capsys):
     cv2.imwrite("0.png", np.zeros((48, 64, 3), np.uint8))
     error = said(capsys, "track", ".")
-    assert "no camera.yaml: say which with --camera, or camera: in a configuration" in error
-    assert "no catheter.yaml: say which with --catheter" in error
+    assert "no camera is given: say which with --camera, or camera: in a configuration" in error
+    assert "no catheter is given: say which with --catheter" in error
     error = said(capsys, "track", ".", *FILES[2:])
     assert "--camera" in error and "--catheter" not in error
     assert not Path("runs").exists()
@@ -279,6 +279,8 @@ def test_a_run_with_few_poses_says_what_to_look_at(tmp_path):
     assert "`radius` (half the thickness)" in first
     assert second.startswith("Refused    2 like frame 5, UNCERTAIN: tip uncertain to 3.0 mm; longer bands")
     assert refusals({"refused": refused, "answered": 22, "frames": 29})
+    few = {"refused": refused, "answered": 2, "frames": 9, "statuses": {"OK": 2, "INCONSISTENT": 7}}
+    assert "the 2 poses beside so many contradictions may be wrong" in refusals(few)[-1]
     assert not refusals({"refused": refused, "answered": 593, "frames": 600})
     for status in Status:
         if not status.answered:
@@ -338,8 +340,8 @@ def test_ports_that_are_none(capsys):
 def test_stream_of_a_video_takes_a_camera_and_a_catheter(capsys):
     cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
     to = ["--to", "127.0.0.1:1"]
-    assert "no camera.yaml: say which with --camera" in said(capsys, "stream", ".", *to)
-    assert "no catheter.yaml: say which with --catheter" in said(capsys, "stream", ".", *FILES[:2], *to)
+    assert "no camera is given: say which with --camera" in said(capsys, "stream", ".", *to)
+    assert "no catheter is given: say which with --catheter" in said(capsys, "stream", ".", *FILES[:2], *to)
     assert "expected one source to track and stream, got 2" in said(capsys, "stream", "a.mp4", "b.mp4", *FILES, *to)
     words = ["--replay . is the source itself: leave a.mp4 out"]
     assert said(capsys, "stream", "a.mp4", "--replay", ".").splitlines() == words

@@ -171,7 +171,7 @@ def test_a_recording_replays_to_the_same_poses(tmp_path, tracker, capsys):
     ("options", "message"),
     [
         ({"source": "missing.mp4"}, "no such video, folder or camera"),
-        ({"camera": None}, "no camera.yaml: say which with --camera"),
+        ({"camera": None}, "no camera is given: say which with --camera"),
         ({"catheter": "gone.yaml"}, "gone.yaml: cannot read the configuration"),
         ({"out": "in"}, "holds files already"),
     ],
@@ -216,7 +216,7 @@ def test_live_poses_of_a_folder_come_with_its_notes_and_at_the_rate_asked_for(tm
     assert "calibrated at another resolution" in capsys.readouterr().out
     with pytest.raises(ConfigError, match="expected one source to track and stream, got 2"):
         live(["a.mp4", "b.mp4"], *files)
-    with pytest.raises(ConfigError, match="no camera.yaml"):  # at once, not with the first frame
+    with pytest.raises(ConfigError, match="no camera is given"):  # at once, not with the first frame
         live([str(source)], None, files[1])
 
 

@@ -12,6 +12,7 @@ from paths import CONFIGS
 from holotorch.cli import main
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.volume.experiment import VolumeExperiment, build
+from holotorch.experiments.volume.plan import seen_from
 
 UP = {"-y": (0, -1, 0), "y": (0, 1, 0), "z": (1, 0, 0), "-z": (-1, 0, 0), "x": (0, 0, 1), "-x": (0, 0, -1)}
 
@@ -82,6 +83,9 @@ def test_an_observer_sees_the_body_and_not_its_mirror_image(flipped, tmp_path):
     assert (near, far) == ((back, face) if turned else (face, back))
     around = lump(scanned(tmp_path, "view.azimuth_deg=180", flipped=flipped).rendering()[0])
     assert around == near
+    text = seen_from(scanned(tmp_path, "view.front=near", flipped=flipped))
+    signs = ("", "-") if turned else ("-", "")
+    assert text == "from {}y in the coordinates of its file, with z up and {}x to the right".format(*signs)
 
 
 def test_a_left_handed_space_is_known(tmp_path):
