@@ -48,7 +48,7 @@ def test_one_static_page_with_pictures_inside(folders):
     assert "<script" not in page and "http" not in page
     assert "width=device-width" in page and "prefers-color-scheme: dark" in page  # telephones, dark mode
     pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
-    assert len(pictures) == page.count("<img") == 7
+    assert len(pictures) == page.count("<img") == 8
     assert all(base64.b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
     for words in ("Target", "No correction", "Corrected", "Convergence", "degC above ambient", "sigma_px: 0.66"):
         assert words in page
@@ -63,7 +63,7 @@ def test_columns_that_say_nothing_are_left_out(folders):
 def test_several_runs_are_compared(folders, tmp_path):
     write_report(folders, tmp_path / "both.html")
     page = (tmp_path / "both.html").read_text()
-    assert page.count("<img") == 14
+    assert page.count("<img") == 16
     assert re.search(r"<h1>Runs</h1>.*first &lt;b&gt;.*second", page, re.S)
 
 
