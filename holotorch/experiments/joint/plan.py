@@ -11,7 +11,7 @@ from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
-from holotorch.experiments.volume.plan import dark_picture, seen_from
+from holotorch.experiments.volume.plan import dark_picture, viewpoint
 from holotorch.optics.light.coherence import depth_of_focus
 
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
@@ -68,7 +68,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, on {len(values['foci_mm'])} planes from "
         f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
-        f"View       {seen_from(experiment.scene)}",
+        f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient{memory}",

@@ -110,7 +110,7 @@ class VolumeExperiment:
         about_x = ((math.cos(e), -math.sin(e), 0), (math.sin(e), math.cos(e), 0), (0, 0, 1))
         x, y, standing = (torch.tensor(rows, dtype=torch.float64) for rows in (about_x, about_y, _STANDING[view.up]))
         rotation = x @ y @ standing
-        if view.front == "far":  # of the mirrored volume, see _as_seen
+        if view.front == "far":  # of the mirrored volume, see _unmirrored
             mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
             rotation = mirror[:, None] * rotation * mirror
         return rotation.round(decimals=15)
@@ -328,7 +328,7 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     volume, synthetic = open_volume(settings.volume)
     try:
         volume.check_finite()
-        volume = _as_seen(volume, settings.view.front)
+        volume = _unmirrored(volume, settings.view.front)
         device = find_device(settings.device)
         volume = replace(volume, values=volume.values.to(device))
         experiment = VolumeExperiment(settings, volume, synthetic, device)
@@ -348,7 +348,7 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     return experiment
 
 
-def _as_seen(volume: Volume, front: str) -> Volume:
+def _unmirrored(volume: Volume, front: str) -> Volume:
     """The volume, mirrored along x where its observer would see the mirror image of what was scanned.
 
     The columns of every picture go to the right and its rows downwards. From the hologram's side, depths go away from

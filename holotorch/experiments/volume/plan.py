@@ -106,13 +106,13 @@ def _evaluation_seconds(experiment: VolumeExperiment, machine: Machine) -> dict[
     }
 
 
-def seen_from(experiment: VolumeExperiment) -> str:
-    """From where the volume is seen, in the coordinates of its file."""
-    far = 1.0 if experiment.settings.view.front == "far" else -1.0
+def viewpoint(experiment: VolumeExperiment) -> str:
+    """Directions of the file's coordinates towards the observer, upwards and to the right, in words."""
+    observer = 1.0 if experiment.settings.view.front == "far" else -1.0  # sign of his direction along depths
     # The rows of the scene, (z, y, x), each as a direction (z, y, x) of the file.
     scene = experiment.rotation @ torch.tensor(experiment.volume.orientation, dtype=torch.float64)
     names = []
-    for direction in (far * scene[0], -scene[1], scene[2]):
+    for direction in (observer * scene[0], -scene[1], scene[2]):
         k = int(direction.abs().argmax())
         about = "about " if direction[k].abs() < 0.99 else ""
         names.append(f"{about}{'-' if direction[k] < 0 else ''}{'zyx'[k]}")
@@ -129,7 +129,7 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     nearest, farthest = values["depths_mm"]
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide",
-        f"View       {seen_from(experiment)}",
+        f"View       {viewpoint(experiment)}",
         f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
         f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end first; predicted error of the "
         f"rendering by slabs this thick: {100 * values['slab_error']:.2g} %",

@@ -64,13 +64,15 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
             return _write(opened, experiment, state, errors)
 
 
-_SEEN = "as scanned"  # runs of before showed the mirror image, and must not be completed by this
+_HANDEDNESS = "as scanned"  # runs of before showed the mirror image, and must not be completed by this
 
 
 def fingerprint_inputs(experiment: VolumeExperiment) -> tuple[VolumeSettings, dict[str, tuple[Any, ...]], set[str]]:
     """Settings, inputs and free keys for :func:`fingerprint`; a resumed run may change seeds and device."""
     volume, file = experiment.volume, experiment.settings.transfer.file
-    inputs: dict[str, tuple[Any, ...]] = {"volume": (volume.values.cpu(), repr((volume.spacing, volume.unit, _SEEN)))}
+    inputs: dict[str, tuple[Any, ...]] = {
+        "volume": (volume.values.cpu(), repr((volume.spacing, volume.unit, _HANDEDNESS)))
+    }
     if file:
         inputs["transfer.file"] = (Path(file).read_bytes(),)
     return experiment.settings, inputs, {"device", "report.seeds"}

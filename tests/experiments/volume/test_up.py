@@ -12,7 +12,7 @@ from paths import CONFIGS
 from holotorch.cli import main
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.volume.experiment import VolumeExperiment, build
-from holotorch.experiments.volume.plan import seen_from
+from holotorch.experiments.volume.plan import viewpoint
 
 UP = {"-y": (0, -1, 0), "y": (0, 1, 0), "z": (1, 0, 0), "-z": (-1, 0, 0), "x": (0, 0, 1), "-x": (0, 0, -1)}
 
@@ -77,13 +77,13 @@ def lump(picture: torch.Tensor) -> tuple[str, str, str]:
 def test_an_observer_sees_the_body_and_not_its_mirror_image(flipped, tmp_path):
     """Face to face, its left is at the observer's right; from behind, at his left."""
     face, back = ("red", "right", "high"), ("green", "right", "low")
-    turned = flipped == 1  # stored from the back on, so that the ends change places
+    turned = flipped == 1  # stored from the back on, so that the ends change centres
     near = lump(scanned(tmp_path, "view.front=near", flipped=flipped).rendering()[0])
     far = lump(scanned(tmp_path, flipped=flipped).rendering()[0])
     assert (near, far) == ((back, face) if turned else (face, back))
     around = lump(scanned(tmp_path, "view.azimuth_deg=180", flipped=flipped).rendering()[0])
     assert around == near
-    text = seen_from(scanned(tmp_path, "view.front=near", flipped=flipped))
+    text = viewpoint(scanned(tmp_path, "view.front=near", flipped=flipped))
     signs = ("", "-") if turned else ("-", "")
     assert text == "from {}y in the coordinates of its file, with z up and {}x to the right".format(*signs)
 
@@ -102,12 +102,12 @@ def test_angles_turn_what_the_observer_sees_to_the_right_and_downwards(front, tm
         for word in ("view.azimuth_deg=0", "view.azimuth_deg=20", "view.elevation_deg=20")
     ]
     channel, other = (0, 1) if colour == "red" else (1, 0)
-    places = []
+    centres = []
     for picture in pictures:
         share = (picture[channel] - picture[other]).clamp(min=0)
         y, x = torch.meshgrid(*(torch.arange(n, dtype=share.dtype) for n in share.shape), indexing="ij")
-        places.append(((share * x).sum() / share.sum(), (share * y).sum() / share.sum()))
-    assert places[1][0] > places[0][0] + 1 and places[2][1] > places[0][1] + 1
+        centres.append(((share * x).sum() / share.sum(), (share * y).sum() / share.sum()))
+    assert centres[1][0] > centres[0][0] + 1 and centres[2][1] > centres[0][1] + 1
 
 
 @pytest.mark.parametrize("front", ["far", "near"])
