@@ -17,6 +17,29 @@ from holotorch.experiments.perception.study.log import read_log
 from holotorch.experiments.streaming.chromium import CHROMIUM, browser
 
 CONFIG = ROOT / "configs" / "perception" / "factors.yaml"
+# Once a pattern is shown, the page's frames of one second in steps of 50 ms, whatever the machine is busy with:
+# rows of the pattern's colour, all away from the fixation point, together with where it should be.
+FRAMES = """(() => {
+  const next = window.requestAnimationFrame.bind(window);
+  const rows = () => {
+    const side = trial.side === "left" ? -1 : 1, left = side < 0 ? 0 : canvas.width / 2 + 40;
+    const wide = canvas.width / 2 - 40, data = pen.getImageData(left, 0, wide, canvas.height).data;
+    let [low, high] = [canvas.height, -1];
+    for (let y = 0; y < canvas.height; y++) for (let x = 0; x < wide; x++)
+      if (Math.abs(data[4 * (y * wide + x)] - GREY) <= 1)
+        [low, high] = [Math.min(low, y), Math.max(high, y)];
+    return [low, high, up, trial.eccentricity_deg, (last - onset) / 1000];
+  };
+  window.requestAnimationFrame = call => next(t => {
+    call(t);
+    if (window.seen || document.body.dataset.state !== "shown") return;
+    const usual = window.requestAnimationFrame;
+    window.requestAnimationFrame = () => 0;
+    window.seen = Array.from({length: 20}, (_, i) => { tick(onset + 50 * (i + 1)); return rows(); });
+    window.requestAnimationFrame = usual;
+  });
+})()"""
+PRESS = "dispatchEvent(new KeyboardEvent('keydown', {key: ' ', code: 'Space'}))"
 FACTORS = TINY + "contrasts: 0.3\nspeeds_deg_s: 20\ntiming: {wait_s: [0.05, 0.1], show_s: 1.2, feedback_s: 0.05}\n"
 
 
@@ -111,29 +134,14 @@ def test_the_page_draws_contrast_and_motion(tmp_path):
             # Up, down and back at constant speed: 2.5 deg in 0.25 s at 10 deg/s.
             path = await tab.value("[0, 0.125, 0.25, 0.5, 0.75, 1, 1.25].map(s => height(10, s))")
             assert path == pytest.approx([0, 1.25, 2.5, 0, -2.5, 0, 2.5])
-            press = "dispatchEvent(new KeyboardEvent('keydown', {key: ' ', code: 'Space'}))"
-            state = "document.body.dataset.state"
-            await tab.until(f"{state} === 'message' && {press}, {state} === 'shown'")
             grey = int((await tab.value("grey(0.3)")).split(",")[1])
-            # Rows of the pattern's colour, all away from the fixation point, together with where it should be.
-            rows = f"""(() => {{
-              if ({state} !== "shown") return null;
-              const side = trial.side === "left" ? -1 : 1, left = side < 0 ? 0 : canvas.width / 2 + 40;
-              const wide = canvas.width / 2 - 40, data = pen.getImageData(left, 0, wide, canvas.height).data;
-              let [low, high] = [canvas.height, -1];
-              for (let y = 0; y < canvas.height; y++) for (let x = 0; x < wide; x++)
-                if (Math.abs(data[4 * (y * wide + x)] - {grey}) <= 1)
-                  [low, high] = [Math.min(low, y), Math.max(high, y)];
-              return [low, high, up, trial.eccentricity_deg, (last - onset) / 1000];
-            }})()"""
-            seen = []
-            for _ in range(12):
-                seen.append(await tab.value(rows))
-            return [found for found in seen if found]  # none once the pattern has gone
+            await tab.value(FRAMES.replace("GREY", str(grey)))
+            await tab.until(f"document.body.dataset.state === 'message' && {PRESS}, window.seen")
+            return await tab.value("seen")
 
     seen = asyncio.run(asyncio.wait_for(take(), 60))
     runner.stop()
-    assert len(seen) >= 4 and max(s[2] for s in seen) - min(s[2] for s in seen) > 1, seen
+    assert len(seen) == 20 and max(s[2] for s in seen) - min(s[2] for s in seen) > 3, seen
     for low, high, up, angle, seconds in seen:
         # A triangle of 2.5 deg up and down at 20 deg/s has a period of 0.5 s.
         assert up == pytest.approx(5 / math.pi * math.asin(math.sin(4 * math.pi * seconds)), abs=1e-6)
