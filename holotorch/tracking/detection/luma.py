@@ -5,6 +5,7 @@ often displaced by half a pixel. A fit to all channels is then wrong by up to a 
 """
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,10 @@ _MIXES = np.stack([_LUMA, np.array([1.0, 0.0, 0.0]) - _LUMA]).astype(np.float32)
 _LEVEL_SD = 2.5  # assumed standard deviation of a pixel's level; fits rescale it by their residuals
 _PATCH = 24  # side in pixels of the patches in which the resolution of chroma is estimated
 _COARSE = 0.6  # largest ratio of the changes of red minus luma to the changes of luma at which chroma is coarse
+_CHROMA = np.array([0.564, 0.713])  # factors of blue and red minus luma in chroma, ITU-R BT.601
+_CLEAR = 0.1  # deviation in pixels up to which an edge is clear in luma
+_STEP = 0.3  # largest difference of its step of luma from the expected one, as a fraction of this; usually 0.1
+_AGREES = 0.5  # largest difference in pixels of a position from weak luma from that of the other channels
 _ASIDE = 0.25  # standard deviation in pixels of the error that coarse chroma adds to the position of an edge
 
 
@@ -54,9 +59,10 @@ def fit_luma(
 ) -> tuple[EdgeFit, EdgeFit]:
     """Fit edges to luma, and use its positions where they are more precise than those of all channels.
 
-    Blur acts on linear light, whereas luma is a sum of gamma-encoded levels, so that the luma profile of a blurred edge
-    is not an error function. The profile is computed from the light on both sides of the edge, which chroma subsampling
-    does not change.
+    An edge between colours of similar luma is hardly visible in luma: a fit to it follows noise, and its deviation is
+    too small. There the position is that of all channels, or of chroma alone if the channels disagree. On development
+    seeds of the second world through JPEG, positions from luma with deviations below 0.1 pixels were 0.08 pixels off in
+    the median, those with larger ones 0.17, and those from all channels 0.14.
 
     Args:
         fit: Fit of all channels to ``light``.
@@ -72,25 +78,65 @@ def fit_luma(
     """
     rows = shown.sum(1)[..., None]
     low, step = ((value * rows).sum(1) / np.maximum(rows.sum(1), 1e-9) for value in (fit.levels, fit.steps))  # [E, 3]
+    mixed = partial(_fit_mixture, light, shown, low, step, curve, float(np.median(fit.blur)), t)
+    luma = mixed(np.broadcast_to(_LUMA, low.shape))
+    levels = np.arange(256.0)
+    chroma = mixed(_chroma_direction(np.interp(low + step, curve, levels) - np.interp(low, curve, levels)))
+    # Positions from coarse chroma may be wrong by up to half a chroma pixel, and by more if the channels disagree.
+    deviation = np.hypot(fit.apart * fit.deviation, _ASIDE)
+    fit = dataclasses.replace(fit, deviation=deviation)
+    fit = _replaced(fit, dataclasses.replace(chroma, deviation=np.hypot(chroma.deviation, _ASIDE)))
+    size = (luma.steps * rows).sum((1, 2)) / np.maximum(rows.sum((1, 2)), 1e-9)  # of luma's step, over the expected one
+    clear = (luma.deviation < _CLEAR) & (np.abs(size - 1) < _STEP)
+    # Luma that is not clear has only the value of another look at what the other channels show.
+    agrees = np.abs(luma.place - fit.place) < _AGREES
+    weak = np.where(agrees, np.hypot(luma.deviation, _ASIDE), np.inf)
+    luma = dataclasses.replace(luma, deviation=np.where(clear, luma.deviation, weak))
+    better = (luma.deviation < fit.deviation)[:, None, None]
+    return _replaced(fit, luma), dataclasses.replace(luma, told=luma.told * better)
 
+
+def _replaced(fit: EdgeFit, other: EdgeFit) -> EdgeFit:
+    """The ``fit`` with position, blur and deviation of the ``other`` for edges where that has the smaller deviation."""
+    better = other.deviation < fit.deviation
+    names = "place", "deviation", "blur"
+    return dataclasses.replace(fit, **{n: np.where(better, getattr(other, n), getattr(fit, n)) for n in names})
+
+
+def _fit_mixture(
+    light: np.ndarray,
+    shown: np.ndarray,
+    low: np.ndarray,
+    step: np.ndarray,
+    curve: np.ndarray,
+    blur: float,
+    t: np.ndarray | None,
+    shares: np.ndarray,
+) -> EdgeFit:
+    """Fit of edges to a sum of the channels' levels with ``shares`` [E, 3], such as luma.
+
+    Blur acts on linear light, and the sum is of gamma-encoded levels, so that the profile of a blurred edge is not an
+    error function. It is computed from the light ``low`` [E, 3] before the edge and its ``step`` [E, 3], which chroma
+    subsampling does not change. Its fitted steps are relative to this profile. Other arguments as in :func:`fit_luma`.
+    """
     levels = np.arange(256.0)
     steep = np.gradient(levels) / np.gradient(curve.astype(np.float64))  # derivative of the level with respect to light
 
     def shape(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         rise, *slopes = np.moveaxis(normal_step(t, place, sigma)[..., None], 1, 0)  # [E, T, 1] each
         here = low[:, None] + step[:, None] * rise  # [E, T, 3]
-        each = np.interp(here, curve, steep) * step[:, None] @ _LUMA
-        return np.stack([np.interp(here, curve, levels) @ _LUMA, *(each * slope[..., 0] for slope in slopes)], 1)
+        each = (np.interp(here, curve, steep) * (step * shares)[:, None]).sum(-1)
+        value = (np.interp(here, curve, levels) * shares[:, None]).sum(-1)
+        return np.stack([value, *(each * slope[..., 0] for slope in slopes)], 1)
 
-    luma = np.interp(light, curve, levels) @ _LUMA
-    weight = shown[..., None] / (_LEVEL_SD**2 * float(_LUMA @ _LUMA))
-    found = fit_edges(luma[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape, t)
-    # The deviation of a position from all channels is increased: such a position may be wrong by up to half a chroma
-    # pixel, and by more if the channels disagree.
-    worse = np.hypot(fit.apart * fit.deviation, _ASIDE)
-    better = found.deviation < worse
-    fit = dataclasses.replace(fit, deviation=worse)
-    surer = {
-        name: np.where(better, getattr(found, name), getattr(fit, name)) for name in ("place", "deviation", "blur")
-    }
-    return dataclasses.replace(fit, **surer), dataclasses.replace(found, told=found.told * better[:, None, None])
+    mixture = (np.interp(light, curve, levels) * shares[:, None, None]).sum(-1, keepdims=True)
+    power = np.maximum((shares * shares).sum(-1), 1e-9)[:, None, None, None]
+    return fit_edges(mixture, shown[..., None] / (_LEVEL_SD**2 * power), blur, shape, t)
+
+
+def _chroma_direction(change: np.ndarray) -> np.ndarray:
+    """Shares [E, 3] of the channels in the chroma that ``change`` [E, 3] of their levels changes most; unit vectors."""
+    axes = np.eye(3)[[2, 0]] - _LUMA  # blue and red minus luma, of which codecs store multiples
+    axes *= _CHROMA[:, None]
+    shares = change @ axes.T @ axes
+    return shares / np.maximum(np.sqrt((shares * shares).sum(-1, keepdims=True)), 1e-9)

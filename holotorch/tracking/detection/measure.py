@@ -241,11 +241,11 @@ def measure_edges(
         if np.count_nonzero(known) > 1 and median(fit.blur[known]) > _LIMITS.smeared > blur:
             t[chosen] = near + fit.place  # the tube moved along itself: the window is too short for this blur
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
-        coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
+        coarse = bool(np.any(coarse_colours(sampler, pixels[[0, len(pixels) // 2, -1], len(along) // 2, half])))
         shading, looks = fit, looks - 1
         closer = partial(_refitted, weight=weight, blur=blur, along=along, u=u, widths=widths)
         if coarse:
-            closer = partial(fit_luma, shown=shown, curve=sampler.light, t=along)
+            closer = partial(_refitted_luma, weight=weight, blur=blur, along=along, shown=shown, curve=sampler.light)
         if coarse or not _astray(fit, looks):
             fit, shading = closer(fit, light)
         if _unsure(fit) and not _astray(fit, looks):
@@ -328,6 +328,26 @@ def _refitted(
         close = (np.abs(along) <= _WINDOW.close + 2 * blur)[:, None, None]
         fit = fit.or_better(fit_edges(light, weight * close, blur, t=along))
     return fit, fit
+
+
+def _refitted_luma(
+    fit: EdgeFit,
+    light: np.ndarray,
+    weight: np.ndarray,
+    blur: float,
+    along: np.ndarray,
+    shown: np.ndarray,
+    curve: np.ndarray,
+) -> tuple[EdgeFit, EdgeFit]:
+    """The results of :func:`fit_luma` or, for unsure edges, those of a shorter window if they are better."""
+    fit, luma = fit_luma(fit, light, shown, curve, along)
+    if not (fit.deviation < _LIMITS.vague).all():
+        # An object that lies across the tube beside an edge is another edge in its window.
+        close = np.abs(along) <= _WINDOW.close + 2 * blur
+        near = fit_edges(light, weight * close[:, None, None], blur, t=along)
+        other, other_luma = fit_luma(near, light, shown * close[:, None], curve, along)
+        fit, luma = fit.or_better(other), luma.or_better(other_luma)
+    return fit, luma
 
 
 def _unsure(fit: EdgeFit) -> bool:

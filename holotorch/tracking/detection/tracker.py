@@ -488,7 +488,8 @@ class CatheterTracker(nn.Module):
         than the others is something else.
         """
         number = np.arange(len(edges.t))
-        absent = (edges.deviation > _SEARCH.vague * edges.deviation.min()) & ~np.isin(number, edges.outside)
+        clear = math.hypot(float(edges.deviation.min()), _FLOORS.coarse_edge * edges.coarse)
+        absent = (edges.deviation > _SEARCH.vague * clear) & ~np.isin(number, edges.outside)
         if not completed:
             absent &= np.isfinite(edges.t) & missing | np.isin(number, edges.absent)
         if crossed is not None:

