@@ -112,7 +112,7 @@ def _verdict(run: RunRecord) -> str:
     speckle = ", where a Fourier hologram is speckled" if "isolated" not in corrected else ""
     spots = sum(corrected.get("dark_spots", ()))
     if spots:
-        stop += f"; {spots} bright pixels came out dark, which is speckle noise: solver.reruns or solver.start may help"
+        stop += f"; bright pixels that came out dark: {spots}, by speckle noise: solver.reruns or solver.start may help"
     fewer = any(method["frames"] < corrected["frames"] for method in run.summary["methods"].values())
     single = " The methods that it is compared with show a single frame." if fewer else ""
     return (

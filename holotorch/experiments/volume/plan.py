@@ -116,7 +116,13 @@ def viewpoint(experiment: VolumeExperiment) -> str:
         k = int(direction.abs().argmax())
         about = "about " if direction[k].abs() < 0.99 else ""
         names.append(f"{about}{'-' if direction[k] < 0 else ''}{'zyx'[k]}")
-    return "from {} in the coordinates of its file, with {} up and {} to the right".format(*names)
+    text = "from {} in the coordinates of its file, with {} up and {} to the right".format(*names)
+    z, y, x = experiment.volume.orientation
+    plain = (z, y) == ((1, 0, 0), (0, 1, 0)) and abs(x[2]) == 1  # as of a file that states no directions
+    source = experiment.settings.volume
+    if plain and source.path and not source.left_handed:
+        text += "; if the file does not say how its axes lie, left and right are a guess (volume.left_handed)"
+    return text
 
 
 def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:

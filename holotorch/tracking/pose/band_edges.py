@@ -220,7 +220,7 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
             else "views of a moving tip determine the edges only up to shift, scale and projective stretch: three "
             f"independent distances, one of them from the tip, must be known (a band in the middle of another distance "
             f"adds nothing to it), got known={list(known)}; or let the tip rest in one place, tilt the catheter around "
-            "it and say resting_tip=True"
+            "it and say resting_tip=True (--resting)"
         )
     _, values, vectors = torch.linalg.svd(rows)
     rank = int((values > 1e-9).sum())

@@ -85,7 +85,10 @@ def test_an_observer_sees_the_body_and_not_its_mirror_image(flipped, tmp_path):
     assert around == near
     text = viewpoint(scanned(tmp_path, "view.front=near", flipped=flipped))
     signs = ("", "-") if turned else ("-", "")
-    assert text == "from {}y in the coordinates of its file, with z up and {}x to the right".format(*signs)
+    words = "from {}y in the coordinates of its file, with z up and {}x to the right".format(*signs)
+    assert text.startswith(words) and ("left and right are a guess" in text) == (not turned)
+    stated = scanned(tmp_path, "volume.left_handed=true", flipped=flipped)
+    assert "guess" not in viewpoint(stated)
 
 
 def test_a_left_handed_space_is_known(tmp_path):
