@@ -32,10 +32,10 @@ FRAMES = """(() => {
   };
   window.requestAnimationFrame = call => next(t => {
     call(t);
-    if (window.seen || document.body.dataset.state !== "shown") return;
+    if (window.frames_drawn || document.body.dataset.state !== "shown") return;
     const usual = window.requestAnimationFrame;
     window.requestAnimationFrame = () => 0;
-    window.seen = Array.from({length: 20}, (_, i) => { tick(onset + 50 * (i + 1)); return rows(); });
+    window.frames_drawn = Array.from({length: 20}, (_, i) => { tick(onset + 50 * (i + 1)); return rows(); });
     window.requestAnimationFrame = usual;
   });
 })()"""
@@ -136,8 +136,8 @@ def test_the_page_draws_contrast_and_motion(tmp_path):
             assert path == pytest.approx([0, 1.25, 2.5, 0, -2.5, 0, 2.5])
             grey = int((await tab.value("grey(0.3)")).split(",")[1])
             await tab.value(FRAMES.replace("GREY", str(grey)))
-            await tab.until(f"document.body.dataset.state === 'message' && {PRESS}, window.seen")
-            return await tab.value("seen")
+            await tab.until(f"document.body.dataset.state === 'message' && {PRESS}, window.frames_drawn")
+            return await tab.value("frames_drawn")
 
     seen = asyncio.run(asyncio.wait_for(take(), 60))
     runner.stop()
