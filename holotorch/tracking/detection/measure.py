@@ -241,7 +241,7 @@ def measure_edges(
         if np.count_nonzero(known) > 1 and median(fit.blur[known]) > _LIMITS.smeared > blur:
             t[chosen] = near + fit.place  # the tube moved along itself: the window is too short for this blur
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
-        coarse = bool(np.any(coarse_colours(sampler, pixels[[0, len(pixels) // 2, -1], len(along) // 2, half])))
+        coarse = coarse_colours(sampler, pixels[[0, len(pixels) // 2, -1], len(along) // 2, half])
         shading, looks = fit, looks - 1
         closer = partial(_refitted, weight=weight, blur=blur, along=along, u=u, widths=widths)
         if coarse:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,11 +85,14 @@ class Axis:
 class Stations:
     """Samples across the bands at stations along ``line``, as :func:`fit_axis` takes them.
 
-    ``extent`` is the distance in pixels from the first to the last sampled position.
+    ``extent`` is the distance in pixels from the first to the last sampled position. ``light`` [3, S, U] are the
+    samples in linear light, each the mean of ``samples`` neighbouring ones.
     """
 
     line: Line
     extent: float
+    light: np.ndarray
+    samples: int
     signal: np.ndarray
     weight: np.ndarray
     t: np.ndarray
@@ -145,8 +148,8 @@ def look_across(
     ]
     band, t = np.repeat(np.arange(len(parts)), each), np.concatenate(parts)
     light = sampler(line.pixels(lens, t.ravel(), u)).reshape(3, *t.shape, len(u)).sum(2) / np.float32(samples)
-    signal, weight, *levels = _contrast(light, u, width, band, samples)
-    return Stations(line, float(t.max() - t.min()), signal, weight, t.mean(-1), band, *levels)
+    signal, weight, *levels = best_contrast(light, width, band, samples)
+    return Stations(line, float(t.max() - t.min()), light, samples, signal, weight, t.mean(-1), band, *levels)
 
 
 def measure_axis(
@@ -164,8 +167,7 @@ def measure_axis(
     given = stations.signal, stations.weight, stations.t, stations.band, stations.level, stations.bright
     fit = fit_axis(*given, width, blur, known, before.fit.unknown if before else None)
     axis = _axis(stations, fit)
-    lost = not np.isfinite(fit.covariance).all() or fit.moving > _LIMITS.moving
-    if lost or not 0 < axis.width < 2 * width[0] + 3:
+    if not converged(fit) or not 0 < axis.width < 2 * width[0] + 3:
         raise Refusal(Status.NO_AXIS, "the bands have no clear sides")
     if min(fit.contrast) < _LIMITS.one_sided:
         raise Refusal(Status.NO_AXIS, "the bands' colours go on beside the line: too wide for the catheter")
@@ -218,51 +220,65 @@ def measure_width(
     return stations, axis, width
 
 
+def converged(fit: AxisFit) -> bool:
+    """Whether the fit has a solution with errors."""
+    return bool(np.isfinite(fit.covariance).all()) and fit.moving <= _LIMITS.moving
+
+
 def narrowed(stations: Stations, axis: Axis, width: tuple[float, float], known: float) -> Axis:
     """``axis`` for a more precise ``width`` (pixels at t = 0, taper per pixel) of relative deviation ``known``."""
     return _axis(stations, axis.fit.given(width, known))
 
 
 def _axis(stations: Stations, fit: AxisFit) -> Axis:
-    """Axis from a fit; ``centre`` is where the errors of offset and slope are uncorrelated."""
     offset, slope, wide, taper = fit.sides.tolist()
-    (variance, cross), (_, other) = fit.covariance[:2, :2].tolist()
-    other = max(other, 1e-18)
-    floor = _LIMITS.floor * wide
-    return Axis(
-        stations.line.moved(offset, slope),
-        wide,
-        taper,
-        math.sqrt(max(float(fit.covariance[2, 2]), 0.0)),
-        math.hypot(math.sqrt(max(variance - cross * cross / other, 0.0)), floor),
-        math.hypot(math.sqrt(other), 2 * floor / max(20.0, stations.extent)),
-        -cross / other,
-        fit,
-    )
+    width_sd = math.sqrt(max(float(fit.covariance[2, 2]), 0.0))
+    axis = Axis(stations.line, wide, taper, width_sd, 0.0, 0.0, 0.0, fit)
+    return moved(stations, axis, np.array([offset, slope]), fit.covariance[:2, :2])
 
 
-def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, samples: int):
-    """Signal [S, U] from light [3, S, U], its inverse variance, and two levels of each band [bands].
+def moved(stations: Stations, axis: Axis, middle: np.ndarray, covariance: np.ndarray) -> Axis:
+    """``axis`` with another line and its errors: ``middle`` [2], offset and slope from the line of the stations.
 
-    In each band the signal is the linear combination of the channels that has the largest ratio of the contrast between
-    tube and background to the noise. The second level combines the channels with absolute weights.
+    Its ``centre`` is where the errors of offset and slope, of ``covariance`` [2, 2], are uncorrelated.
     """
-    away = np.abs(u)
-    where = np.empty((len(u), 2), dtype=np.float32)
-    where[:, 0], where[:, 1] = away <= max(0.6, 0.3 * width), away >= 0.5 * width + 1.5
-    parts = light @ (where / where.sum(0))  # [3, S, 2]
-    member = (band[:, None] == np.arange(band[-1] + 1)).astype(np.float32)
-    own, around = parts.transpose(2, 0, 1) @ (member / np.maximum(member.sum(0), 1))  # [3, bands] each
-    mixes = (own - around) / (variance_of(own) + variance_of(around))
-    mixes = mixes / np.maximum(np.sqrt((mixes * mixes).sum(0)), 1e-12)
-    mix = mixes[:, band, None]  # [3, S, 1]
-    signal = (light * mix).sum(0)
-    variance = (mix * mix * variance_of(light)).sum(0) / samples
-    level, bright = np.array([mixes * own, np.abs(mixes) * own], dtype=np.float64).sum(1)
-    return signal, 1 / np.maximum(variance, 1e-30), level, bright
+    (variance, cross), (_, other) = covariance.tolist()
+    other = max(other, 1e-18)
+    floor = _LIMITS.floor * axis.width
+    return replace(
+        axis,
+        line=stations.line.moved(*middle.tolist()),
+        offset_sd=math.hypot(math.sqrt(max(variance - cross * cross / other, 0.0)), floor),
+        slope_sd=math.hypot(math.sqrt(other), 2 * floor / max(20.0, stations.extent)),
+        centre=-cross / other,
+    )
 
 
 def variance_of(light: np.ndarray) -> np.ndarray:
     """Variance of linear light from the noise of levels: proportional to the squared slope of the sRGB decoding."""
     # NumPy vectorises logarithms and exponentials; its powers take ten times as long.
     return np.exp(np.log(np.maximum(light, 0.002)) * (2.8 / 2.4) + 2 * math.log(_LEVEL_SD * 2.4 / 1.055))
+
+
+def best_contrast(
+    light: np.ndarray, width: float, band: np.ndarray, samples: int, variance_of: Callable = variance_of
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Signal [S, U] from light [C, S, U], its inverse variance, and two levels of each band [bands].
+
+    In each band the signal is the linear combination of the channels that has the largest ratio of the contrast between
+    tube and background to the noise, whose variance is ``variance_of`` the light. The second level combines the
+    channels with absolute weights. ``light`` holds means of ``samples`` samples of a tube of ``width`` pixels.
+    """
+    away = np.abs(np.arange(light.shape[-1]) - light.shape[-1] // 2)
+    where = np.empty((len(away), 2), dtype=np.float32)
+    where[:, 0], where[:, 1] = away <= max(0.6, 0.3 * width), away >= 0.5 * width + 1.5
+    parts = light @ (where / where.sum(0))  # [C, S, 2]
+    member = (band[:, None] == np.arange(band[-1] + 1)).astype(np.float32)
+    own, around = parts.transpose(2, 0, 1) @ (member / np.maximum(member.sum(0), 1))  # [C, bands] each
+    mixes = (own - around) / (variance_of(own) + variance_of(around))
+    mixes = mixes / np.maximum(np.sqrt((mixes * mixes).sum(0)), 1e-12)
+    mix = mixes[:, band, None]  # [C, S, 1]
+    signal = (light * mix).sum(0)
+    variance = (mix * mix * variance_of(light)).sum(0) / samples
+    level, bright = np.array([mixes * own, np.abs(mixes * own)], dtype=np.float64).sum(1)
+    return signal, 1 / np.maximum(variance, 1e-30), level, bright

@@ -26,6 +26,7 @@ from holotorch.tracking.detection.colours import ColourTable
 from holotorch.tracking.detection.completion import complete_edges, lies_across
 from holotorch.tracking.detection.ends import shows_reversed
 from holotorch.tracking.detection.footprint import axis_on_plane, bulge_px, width_px
+from holotorch.tracking.detection.luma import fit_coarse_axis
 from holotorch.tracking.detection.measure import BLURRED, Edges, find_bands, halfway, measure_edges
 from holotorch.tracking.detection.stations import (
     STATION_PLAN,
@@ -62,7 +63,6 @@ class ErrorFloors:
     coarse_edge: float = 0.07  # edges of frames whose chroma has fewer pixels than their luma (4:2:0 codecs)
     line: float = 0.02  # offset of the line: light from one side moves the apparent middle of the tube
     stations: float = 2.5  # ratio of the line's deviations to those of its fit: background textures are correlated
-    coarse_line: float = 0.17  # offset of the line in the same frames
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +90,7 @@ class SearchLimits:
     bulge_change: float = 0.1  # change of a ring's bulge above which the edges are measured again
     bulge_settled: float = 0.05  # change of a ring's bulge below which the pose is not computed again
     aside: float = 16.0  # largest distance of the tube, with its blur, from a segment of the search of a whole frame
-    vague: float = 5.0  # largest ratio of the deviations of two edges, if colours do not show all edges
+    vague: float = 3.7  # largest ratio of the deviations of two edges, if colours do not show all edges
     full: float = 0.8  # fraction of a band's length that shows its colour if the whole band is visible
     motion: float = 30.0  # largest motion of the catheter between two frames
 
@@ -444,6 +444,9 @@ class CatheterTracker(nn.Module):
                     else measure_axis(stations, wide, _CHECK.exact, *rest)
                 )
                 edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
+            if edges.coarse:
+                axis = fit_coarse_axis(stations, axis, self.lens.light, wide, _CHECK.exact)
+                edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
         missing = np.isnan(edges.t)
         again = float(np.abs(curve - first).max()) > _SEARCH.bulge_change or abs(edges.blur - edges.expected) > BLURRED
         if again or missing.any():
@@ -590,7 +593,7 @@ class CatheterTracker(nn.Module):
         middle = sum(t) / len(t)
         spread = math.sqrt(sum((each - middle) ** 2 for each in t) / len(t))
         shift, turn = _FLOORS.stations * axis.offset_sd, _FLOORS.stations * axis.slope_sd
-        offset = math.hypot(shift, turn * (middle - axis.centre), _FLOORS.line, _FLOORS.coarse_line * edges.coarse)
+        offset = math.hypot(shift, turn * (middle - axis.centre), _FLOORS.line)
         most = max(offset, turn * spread)
         positions = [self._positions[n] for n in known]
         line_pose = pose_on_line(
