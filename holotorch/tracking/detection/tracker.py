@@ -437,16 +437,11 @@ class CatheterTracker(nn.Module):
         with self._timed("axis"):
             # The axis is fitted with the width from pose and radius; the independent width is for the check.
             if before is None or abs(wide[0] - axis.width) > _CHECK.nearly * wide[0]:
-                rest = axis.blur, axis
-                axis = (
-                    narrowed(stations, axis, wide, _CHECK.exact)
-                    if near
-                    else measure_axis(stations, wide, _CHECK.exact, *rest)
-                )
-                edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
+                exact = wide, _CHECK.exact
+                axis = narrowed(stations, axis, *exact) if near else measure_axis(stations, *exact, axis.blur, axis)
             if edges.coarse:
-                axis = fit_coarse_axis(stations, axis, self.lens.light, wide, _CHECK.exact)
-                edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
+                axis = fit_coarse_axis(stations, axis, lens.light, wide, _CHECK.exact)
+            edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
         missing = np.isnan(edges.t)
         again = float(np.abs(curve - first).max()) > _SEARCH.bulge_change or abs(edges.blur - edges.expected) > BLURRED
         if again or missing.any():
