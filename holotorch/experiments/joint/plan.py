@@ -11,7 +11,7 @@ from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
-from holotorch.experiments.volume.plan import dark_picture, viewpoint
+from holotorch.experiments.volume.plan import cut_off, dark_picture, viewpoint
 from holotorch.optics.light.coherence import depth_of_focus
 
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
@@ -66,7 +66,8 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         spread = f"heat spreads by the measured kernel {display.kernel}, {size} px"
     memory = "" if heat is None else f"; {_left(settings):.1%} of the heat is left after a frame"
     lines = [
-        f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, on {len(values['foci_mm'])} planes from "
+        f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {experiment.scene.width * 1e3:.3g} mm "
+        f"wide, on {len(values['foci_mm'])} planes from "
         f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
         f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
@@ -116,7 +117,7 @@ def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
 
 def _notes(experiment: JointExperiment) -> list[str]:
     settings, foci = experiment.settings, experiment.foci
-    notes = dark_picture(experiment.scene)
+    notes = dark_picture(experiment.scene) + cut_off(experiment.scene, "array")
     if (error := experiment.budget.error(SLABS)) > COARSE_PLANES:
         more, left = _more_planes(experiment)
         # The comparison "slabs" shows one plane in each frame.

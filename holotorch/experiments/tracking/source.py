@@ -147,5 +147,5 @@ def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:
     if unsure > SURE:
         frames.notes.append(
             f"the camera's calibration determines its focal length only to {100 * unsure:.1f} %: tips are as far off "
-            "along the line of sight, in all frames alike, which the deviations below exclude"
+            f"along the line of sight, {500 * unsure:.1f} mm at 0.5 m, in all frames alike, besides the deviations"
         )

@@ -204,10 +204,7 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     if words := preset_note(experiment):
         notes.append(words)
     notes += _other_values(experiment)
-    lost = _lost_light(experiment)
-    if lost > 0.005:
-        notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
-    return notes
+    return notes + cut_off(experiment, "rays")
 
 
 def _other_values(experiment: VolumeExperiment) -> list[str]:
@@ -278,13 +275,29 @@ def dark_picture(experiment: VolumeExperiment) -> list[str]:
     ]
 
 
-def _lost_light(experiment: VolumeExperiment) -> float:
-    """Fraction of the volume's light outside the area of the rays, from a coarse rendering of the whole volume."""
-    extent = torch.tensor(experiment.volume.extent, dtype=torch.float64)
-    sides = (experiment.rotation.abs() @ extent / extent.max() * experiment.width).tolist()
+def cut_off(experiment: VolumeExperiment, what: str) -> list[str]:
+    """A note if over 0.5 % of the volume's light lies outside the area of the rays, which the note calls ``what``."""
+    sides = _sides(experiment)
     height, width = experiment.rays.extent
-    if height >= sides[1] and width >= sides[2]:
-        return 0.0
+    fits = min(height / sides[1], width / sides[2])
+    if fits >= 1 or (lost := _lost_light(experiment, sides)) <= 0.005:
+        return []
+    whole = f"{experiment.width * fits * 1e3:.2g} mm"
+    return [
+        f"{100 * lost:.1f} % of the volume's light lies beside the {what}, {width * 1e3:.3g} mm wide and "
+        f"{height * 1e3:.3g} mm high, and is cut off; about 'view.width={whole}' shows all of it"
+    ]
+
+
+def _sides(experiment: VolumeExperiment) -> list[float]:
+    """Depth, height and width in metres of the box around the volume, as it is turned."""
+    extent = torch.tensor(experiment.volume.extent, dtype=torch.float64)
+    return (experiment.rotation.abs() @ extent / extent.max() * experiment.width).tolist()
+
+
+def _lost_light(experiment: VolumeExperiment, sides: list[float]) -> float:
+    """Fraction of the volume's light outside the area of the rays, from a coarse rendering of the whole volume."""
+    height, width = experiment.rays.extent
     finest = min(experiment.volume.spacing) / max(experiment.volume.extent) * experiment.width
     middle, half, planes = experiment.distance, sides[0] / 2, max(24, math.ceil(sides[0] / (4 * finest)))
     coarse = Grid(_COARSE, (sides[1] / _COARSE, sides[2] / _COARSE))

@@ -46,6 +46,14 @@ def test_planes_that_are_slices_of_a_volume_rather_than_the_volume_are_noted():
     assert re.search(r"; display.planes=(\d+) frames=\1 would be \d+% off", with_slabs.text)
 
 
+def test_a_volume_wider_than_the_array_is_noted_with_the_width_that_fits():
+    wide = check(settings("view.width=4 mm"))
+    (note,) = [line for line in wide.text.splitlines() if "is cut off" in line]
+    assert "beside the array" in note and "4 mm wide" in wide.text
+    fits = re.search(r"view\.width=([\d.]+ mm)", note)
+    assert fits and "is cut off" not in check(settings(f"view.width={fits[1]}")).text
+
+
 def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():
     loose, tight = (check(settings(f"tolerance={each}")) for each in (0.5, 0.05))
     assert len(loose.values["foci_mm"]) < len(tight.values["foci_mm"]) <= 64
