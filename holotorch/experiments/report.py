@@ -1,5 +1,6 @@
 """One static HTML page for one or more run folders."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +31,8 @@ def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | 
 def outcome_lines(folder: Path) -> list[str]:
     """The main numbers of a run in words, and where its pictures are; none for a folder without a summary.
 
+    Those of an interrupted run are called "Unfinished", not "Result".
+
     ConfigError if the summary cannot be read.
     """
     lines = []
@@ -37,6 +40,8 @@ def outcome_lines(folder: Path) -> list[str]:
         with _readable(folder):
             run = RunRecord(folder)
             lines += find_kind(run.kind).outcome(run.summary) if run.kind in KINDS else []
+            if run.summary.get("status") == "interrupted":
+                lines = [re.sub("^Result {5}", "Unfinished ", line) for line in lines]
     if any((folder / "images").glob("*.png")):
         lines.append(f"Pictures   {folder / 'images'}")
     return lines

@@ -132,11 +132,13 @@ def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path
     press_in(monkeypatch, 8)
     assert resume(folder) == 130
     words = f"interrupted; what was computed is saved; go on with: holotorch resume {folder}"
-    assert words in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert words in said.err and "Unfinished SSIM" in said.out and "Result  " not in said.out
     press_in(monkeypatch, 0)  # before its first step: the older checkpoint stays
     assert resume(folder) == 130
     press_in(monkeypatch, None)
     assert resume(folder) == 0
+    assert "Result     SSIM" in capsys.readouterr().out
     assert_same(folder, whole(*overrides))
 
 
