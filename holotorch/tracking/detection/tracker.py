@@ -464,7 +464,7 @@ class CatheterTracker(nn.Module):
                 # A stick with one band of another length shows three edges, too, and nothing hides the fourth.
                 expected = self._expected_edges(line_pose, axis.line)
                 if not all(self._crossed(sampler, axis, edges.t, float(at)) for at in expected[lost]):
-                    raise _unexplained(lost)
+                    raise self._unexplained(lost)
             if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
                 text = f"the tube goes on beyond its end on one side only: {_EXCHANGED}"
                 raise Refusal(Status.INCONSISTENT, text, final=True)
@@ -502,7 +502,13 @@ class CatheterTracker(nn.Module):
                 rest = _without(edges, absent)
             if all(self._crossed(sampler, axis, rest.t, float(expected[index])) for index in absent.nonzero()[0]):
                 return rest
-        raise _unexplained(absent)
+        raise self._unexplained(absent)
+
+    def _unexplained(self, absent: np.ndarray) -> Refusal:
+        """Refusal that names the first of the ``absent`` edges, bool [N]."""
+        position = 1e3 * self._positions[int(absent.argmax())]
+        text = f"the edge {position:.3g} mm from the tip is not where the others put it, and nothing hides it"
+        return Refusal(Status.INCONSISTENT, text)
 
     def _crossed(self, sampler: Sampler, axis: Axis, t: np.ndarray, at: float) -> bool:
         """Whether something lies across the tube at or beside ``at``.
@@ -660,12 +666,6 @@ def _without(edges: Edges, absent: np.ndarray) -> Edges:
     """The edges without those that are ``absent`` [N]."""
     t, deviation = np.where(absent, np.nan, edges.t), np.where(absent, np.inf, edges.deviation)
     return dataclasses.replace(edges, t=t, deviation=deviation)
-
-
-def _unexplained(absent: np.ndarray) -> Refusal:
-    """Refusal that names the first of the ``absent`` edges, bool [N]."""
-    text = f"edge {absent.argmax()} is not where the others put it, and nothing hides it"
-    return Refusal(Status.INCONSISTENT, text)
 
 
 def _uncertain(tip_sd: float, most_sd: float) -> str:
