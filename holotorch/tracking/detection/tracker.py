@@ -101,6 +101,7 @@ _NEAR = (
     6.0  # pixels: half the distance up to which an object across the tube disturbs an edge, and error of a rough pose
 )
 _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
+_CONFIRMED = 5.0  # standard deviations of both by which a fit to the pixels may differ from the pose of the edges
 _EXCHANGED = "exchanged red and blue channels (ChannelOrder), or bands not named from the tip on, can cause this"
 
 
@@ -206,9 +207,12 @@ class CatheterTracker(nn.Module):
             fitted = refinement(frames[chosen], tip.to(frames.device), direction.to(frames.device)).poses()
         poses = list(poses)
         for i, pose in zip(chosen, fitted, strict=True):
-            poses[i] = pose
+            before, poses[i] = poses[i], pose
             if pose.answered and float(pose.tip_sd) > self.most_sd:
                 poses[i] = Pose.refused(Status.UNCERTAIN, _uncertain(float(pose.tip_sd), self.most_sd))
+            elif pose.answered and (gap := _distance(before, pose)) > _CONFIRMED:
+                text = f"the fit to the pixels moves the tip by {gap:.3g} standard deviations"
+                poses[i] = Pose.refused(Status.INCONSISTENT, text)
         return poses
 
     def _track(self, frame: Tensor, before: Pose | None) -> Pose:
@@ -666,6 +670,13 @@ def _without(edges: Edges, absent: np.ndarray) -> Edges:
     """The edges without those that are ``absent`` [N]."""
     t, deviation = np.where(absent, np.nan, edges.t), np.where(absent, np.inf, edges.deviation)
     return dataclasses.replace(edges, t=t, deviation=deviation)
+
+
+def _distance(one: Pose, other: Pose) -> float:
+    """Distance of the tips in standard deviations, those of both poses together."""
+    first, second = ((pose.tip.numpy(force=True), pose.covariance[:3, :3].numpy(force=True)) for pose in (one, other))
+    gap = second[0] - first[0]
+    return math.sqrt(gap @ np.linalg.solve(first[1] + second[1], gap))
 
 
 def _uncertain(tip_sd: float, most_sd: float) -> str:

@@ -4,6 +4,8 @@ import gc
 import math
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -164,6 +166,20 @@ def test_the_work_for_a_frame_is_bounded(monkeypatch):
     assert len(looked) == 1
     monkeypatch.setattr(tracker_module, "find_segments", lambda *_, **__: [there, *EMPTY])
     refused(TRACKER(frame[None])[0], Status.INCONSISTENT)
+
+
+@pytest.mark.parametrize(("factor", "status"), [(1.0, Status.OK), (8.0, Status.INCONSISTENT)])
+def test_a_refinement_far_from_the_pose_of_the_edges_is_refused(factor, status):
+    """It starts from this pose, and may converge to another one where the background is like an edge."""
+    pose = TRACKER(scenes()["plain"][1][None])[0]
+    deviation = (2 * pose.covariance[:3, :3].diagonal()).sqrt()
+    other = replace(pose, tip=pose.tip + factor * deviation * torch.tensor([0.0, 0.0, 1.0]))
+    fit = cast(PhotometricFit, lambda *_: SimpleNamespace(poses=lambda: [other]))
+    tracker = CatheterTracker(WORLD.camera, THESIS, channels=ChannelOrder.RGB)
+    tracker.refinement = fit
+    found = tracker(scenes()["plain"][1][None])[0]
+    assert found.status is status
+    assert found.answered or "the fit to the pixels moves the tip by" in found.reason
 
 
 def test_a_refinement_fits_all_poses_of_a_batch_at_once():
