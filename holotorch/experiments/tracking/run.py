@@ -45,6 +45,8 @@ from holotorch.tracking.pose.alignment import in_frame
 from holotorch.tracking.pose.overlay import overlay
 from holotorch.tracking.streaming.packet import now
 
+_CONFIRMED = 3  # number of poses in a row from which on the next frame is searched near the last one
+
 Entered = TypeVar("Entered")
 
 
@@ -52,11 +54,14 @@ def follow(frames: Iterable[Frame], tracker: Tracker, batch: int = 1) -> Iterato
     """Track frame by frame, or ``batch`` > 1 frames at a time.
 
     The tracker is called as ``tracker(frames [B, 3, H, W], previous)``. Frame by frame, ``previous`` holds the pose of
-    the previous frame, or is None if that frame was refused. In a batch it is None: each frame is searched by itself,
-    so that its pose does not depend on the size of the batch. A tracker may have a dict ``times``, the seconds of each
-    stage of its last call. The times of a frame are the mean over its batch.
+    the previous frame if the last three frames have poses, else it is None: only a search of the whole frame checks
+    the width of the tube, and one frame may pass this check by chance with bands that are named in the wrong order. In
+    a batch it is None: each frame is searched by itself, so that its pose does not depend on the size of the batch. A
+    tracker may have a dict ``times``, the seconds of each stage of its last call. The times of a frame are the mean
+    over its batch.
     """
     previous: list[Pose] | None = None
+    answered = 0  # number of poses since the last refusal
     numbered = enumerate(frames)
     while group := list(islice(numbered, batch)):
         pixels = [frame.pixels for _, frame in group if frame.pixels is not None]
@@ -73,7 +78,8 @@ def follow(frames: Iterable[Frame], tracker: Tracker, batch: int = 1) -> Iterato
             else:
                 pose = next(poses_left)
                 yield Tracked(number, frame, pose, seconds, dict(times))
-            previous = [pose] if batch == 1 and pose.answered else None
+            answered = answered + 1 if pose.answered else 0
+            previous = [pose] if batch == 1 and answered >= _CONFIRMED else None
 
 
 def live(

@@ -72,6 +72,7 @@ class WidthCheck:
     Relative deviations are standard deviations of a width divided by the width.
     """
 
+    narrow: float = 0.8  # least ratio of the widths of a blurred tube, measured over expected, as standard deviations
     slant: float = 1.5  # largest ratio of the width from a rough pose to that from the bands' length: 55 degrees
     vague: float = 0.15  # largest relative deviation of a width that is used to check a pose from three edges
     path: float = 2.5  # longest motion across the tube during the exposure, in widths of the tube
@@ -638,10 +639,12 @@ class CatheterTracker(nn.Module):
         expected = math.hypot(edges.blur, box)
         clear = axis.width_sd < _CHECK.path_deviation * axis.width
         moved = clear and 1 < ratio < _CHECK.path and abs(axis.blur / expected - 1) < _CHECK.path_blur
-        combined = math.hypot(axis.blur, box * ratio) / expected  # determined even where width or blur alone is not
+        path = math.hypot(axis.blur, box * ratio)  # determined even where width or blur alone is not
+        combined = path / expected
+        narrow = cold and path < _CHECK.narrow * math.hypot(min(axis.blur, edges.blur), box)
         if min(axis.blur, edges.blur) > box or (cold and combined > max(ratio, 1.0)):
             ratio = combined
-        if abs(ratio - 1) > most and not moved:
+        if narrow or (abs(ratio - 1) > most and not moved):
             depth = float((line_pose.tip + sum(self._positions) / len(self._positions) * line_pose.direction)[2])
             text = f"{ratio:.2f} times as wide as it should be at {depth:.2f} m"
             raise Refusal(Status.INCONSISTENT, text, final=True)

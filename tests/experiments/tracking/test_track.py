@@ -96,15 +96,18 @@ def test_the_figure_of_no_pose_says_so_and_of_one_frame_has_no_scale(tmp_path):
         assert not each.texts and len(each.get_xticks()) > 2 and len(each.get_yticks()) > 2
 
 
-def test_the_pose_before_is_passed_on_but_not_across_a_refusal():
+def test_the_pose_before_is_passed_on_from_three_on_but_not_across_a_refusal():
+    """Three searches of whole frames must agree before the next frame is searched near the last pose."""
     tracker = StandIn()
-    frames = [Frame(0.0, grey(10)), Frame(0.1, grey(20)), Frame(0.2, grey(0)), Frame(0.3, grey(30))]
-    frames += [Frame(0.4, None, "lost"), Frame(0.5, grey(40))]
+    levels = [10, 20, 30, 40, 0, 50, None, 60, 70, 80, 90]
+    pixels = [None if level is None else grey(level) for level in levels]
+    frames = [Frame(0.1 * i, each, "" if each is not None else "lost") for i, each in enumerate(pixels)]
     found = list(follow(frames, tracker))
-    assert [item.status.name for item in found] == ["OK", "OK", "NO_CATHETER", "OK", "BAD_FRAME", "OK"]
+    refused = {4: "NO_CATHETER", 6: "BAD_FRAME"}
+    assert [item.status.name for item in found] == [refused.get(i, "OK") for i in range(len(levels))]
     given = [None if previous is None else float(previous[0].tip[0]) for previous in tracker.previous]
-    assert given == [None, 10 / 3e3, 20 / 3e3, None, None]
-    assert found[4].pose.reason == "lost" and found[4].seconds == 0
+    assert given == [None, None, None, 30 / 3e3, 40 / 3e3, None, None, None, None, 80 / 3e3]
+    assert found[6].pose.reason == "lost" and found[6].seconds == 0
 
 
 @pytest.mark.parametrize("batch", [2, 5])
