@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial import KDTree
@@ -63,8 +64,10 @@ def test_a_catheter_before_a_fine_board_is_tracked():
     cases = [rendered(photograph, pixels, seed) for seed in range(20, 32)]
     tracker = CatheterTracker(photograph.camera, THESIS, channels=ChannelOrder.RGB)
     pairs = [(tracker(case.frame()[None])[0], case) for case in cases]
-    errors = [float((pose.tip - case.tip).norm()) for pose, case in pairs if pose.answered]
-    assert len(errors) >= 6 and max(errors) < 2e-3
+    errors = np.array([float((pose.tip - case.tip).norm()) for pose, case in pairs if pose.answered])
+    stated = np.array([float(pose.tip_sd) for pose, _ in pairs if pose.answered])
+    assert len(errors) >= 6 and np.median(errors) < 1e-3
+    assert (errors < 3.4 * stated).all()  # errors in depth, which dominate, pass 3.4 deviations once in 1500
 
 
 def test_rows_sheet_and_lines():
