@@ -305,6 +305,7 @@ def _lost_light(experiment: VolumeExperiment, sides: list[float]) -> float:
     geometry = {"width": experiment.width, "distance": middle, "rotation": experiment.rotation}
     front_to_back = depths[::-1] if experiment.settings.view.front == "far" else depths
     sampler = DVRSampler(experiment.transfer, coarse, front_to_back, **geometry)
+    sampler.checks_slabs = False  # a rough sum of light needs no thin slabs
     with torch.no_grad():
         light = sampler.render(experiment.volume)[0].sum(0)
     total = light.sum().item()
