@@ -47,7 +47,7 @@ def test_a_new_kind_goes_on_where_it_was_interrupted(config, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(ToyKind, "step", pressed)
         assert main(["run", config, "--out", str(folder)]) == 130
-    assert capsys.readouterr().out == f"Steps      4\nResult     total 3\n{folder / 'report.html'}\n"
+    assert capsys.readouterr().out == f"Steps      4\nUnfinished total 3\n{folder / 'report.html'}\n"
     assert json.loads((folder / "interrupted.json").read_text())["total"] == 3
     assert main(["run", config, "steps=6", "--out", str(folder)]) == 2
     assert "steps was 4 and is 6" in capsys.readouterr().err
