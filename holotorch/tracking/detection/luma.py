@@ -15,7 +15,15 @@ from holotorch.tracking.camera.numpy_lens import Points
 from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.detection.axis_fit import fit_axis
 from holotorch.tracking.detection.fits import EdgeFit, fit_edges, normal_step
-from holotorch.tracking.detection.stations import Axis, Stations, best_contrast, converged, moved, variance_of
+from holotorch.tracking.detection.stations import (
+    Axis,
+    Stations,
+    best_contrast,
+    converged,
+    moved,
+    tube_and_background,
+    variance_of,
+)
 
 _LUMA = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue levels in luma, ITU-R BT.601
 _LEVELS = np.arange(256.0)
@@ -152,10 +160,9 @@ def _equal(levels: np.ndarray) -> np.ndarray:
 
 def _stands_out(luma: np.ndarray, band: np.ndarray, width: float) -> np.ndarray:
     """[S] whether the luma [S, U] of each station's band differs from that on both sides of a tube of ``width``."""
-    u = np.arange(luma.shape[1]) - luma.shape[1] // 2
-    beside = 0.5 * width + 1.5
-    parts = np.abs(u) <= max(0.6, 0.3 * width), u <= -beside, u >= beside
-    own, left, right = (luma[:, part].mean(1) for part in parts)
+    tube, background = tube_and_background(luma.shape[1], width)
+    one = np.arange(luma.shape[1]) < luma.shape[1] // 2
+    own, left, right = (luma[:, part].mean(1) for part in (tube, background & one, background & ~one))
     member = band[:, None] == band
     differs = [np.abs(member @ (own - side)) / member.sum(1) > _CONTRAST for side in (left, right)]
     return differs[0] & differs[1]

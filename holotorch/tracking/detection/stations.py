@@ -238,7 +238,7 @@ def _axis(stations: Stations, fit: AxisFit) -> Axis:
 
 
 def moved(stations: Stations, axis: Axis, middle: np.ndarray, covariance: np.ndarray) -> Axis:
-    """``axis`` with another line and its errors: ``middle`` [2], offset and slope from the line of the stations.
+    """``axis`` with another line and its errors: ``middle`` [2], offset in pixels and slope from the stations' line.
 
     Its ``centre`` is where the errors of offset and slope, of ``covariance`` [2, 2], are uncorrelated.
     """
@@ -260,25 +260,29 @@ def variance_of(light: np.ndarray) -> np.ndarray:
     return np.exp(np.log(np.maximum(light, 0.002)) * (2.8 / 2.4) + 2 * math.log(_LEVEL_SD * 2.4 / 1.055))
 
 
+def tube_and_background(count: int, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which of ``count`` samples, bool [U] each, lie surely on a tube of ``width`` pixels and surely beside it."""
+    away = np.abs(np.arange(count) - count // 2)
+    return away <= max(0.6, 0.3 * width), away >= 0.5 * width + 1.5
+
+
 def best_contrast(
-    light: np.ndarray, width: float, band: np.ndarray, samples: int, variance_of: Callable = variance_of
+    light: np.ndarray, width: float, band: np.ndarray, samples: int, variance: Callable = variance_of
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Signal [S, U] from light [C, S, U], its inverse variance, and two levels of each band [bands].
 
     In each band the signal is the linear combination of the channels that has the largest ratio of the contrast between
-    tube and background to the noise, whose variance is ``variance_of`` the light. The second level combines the
+    tube and background to the noise, whose variance is a function of the light. The second level combines the
     channels with absolute weights. ``light`` holds means of ``samples`` samples of a tube of ``width`` pixels.
     """
-    away = np.abs(np.arange(light.shape[-1]) - light.shape[-1] // 2)
-    where = np.empty((len(away), 2), dtype=np.float32)
-    where[:, 0], where[:, 1] = away <= max(0.6, 0.3 * width), away >= 0.5 * width + 1.5
+    where = np.stack(tube_and_background(light.shape[-1], width), -1).astype(np.float32)
     parts = light @ (where / where.sum(0))  # [C, S, 2]
     member = (band[:, None] == np.arange(band[-1] + 1)).astype(np.float32)
     own, around = parts.transpose(2, 0, 1) @ (member / np.maximum(member.sum(0), 1))  # [C, bands] each
-    mixes = (own - around) / (variance_of(own) + variance_of(around))
+    mixes = (own - around) / (variance(own) + variance(around))
     mixes = mixes / np.maximum(np.sqrt((mixes * mixes).sum(0)), 1e-12)
     mix = mixes[:, band, None]  # [C, S, 1]
     signal = (light * mix).sum(0)
-    variance = (mix * mix * variance_of(light)).sum(0) / samples
+    noise = (mix * mix * variance(light)).sum(0) / samples
     level, bright = np.array([mixes * own, np.abs(mixes * own)], dtype=np.float64).sum(1)
-    return signal, 1 / np.maximum(variance, 1e-30), level, bright
+    return signal, 1 / np.maximum(noise, 1e-30), level, bright

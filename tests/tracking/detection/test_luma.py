@@ -247,9 +247,9 @@ def test_the_axis_of_a_thin_tube_with_light_from_one_side_is_in_its_middle(quali
             pose = tracker(torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)[None])[0]
             tip, direction = truth(case)
             points = [tip + middle * direction, tip + (middle + 0.01) * direction, pose.point(middle)]
-            start, end, found = (complex(*world.camera.project(point[None])[0].tolist()) for point in points)
+            start, end, measured = (complex(*world.camera.project(point[None])[0].tolist()) for point in points)
             along = (end - start) / abs(end - start)
-            offsets.append(((found - start) * along.conjugate()).imag)
+            offsets.append(((measured - start) * along.conjugate()).imag)
         known = np.isfinite(offsets)
         assert known.sum() >= 5  # of six frames; a refused one has no place
         return float(np.sqrt(np.mean(np.square(np.array(offsets)[known]))))
@@ -318,7 +318,7 @@ def test_patches_end_at_the_frames_border():
     """A frame hardly larger than a patch, asked beyond all sides: the same patch as at its border."""
     frame = torch.from_numpy(np.random.default_rng(2).integers(100, 140, (3, 32, 40)).astype(np.uint8))
     other = frame.clone()
-    right = 40 - luma._PATCH  # first column of the rightmost patch, in which pairs of columns are alike
+    right = 40 - luma._PATCH  # first column of the rightmost patch, in which pairs of columns are equal
     other[:, :, right:] = other[:, :, right::2].repeat_interleave(2, -1)
     assert asked(other, [-50 + 5j, 0j, 12 + 12j, 12 + 90j], 1) == [False] * 4
     assert asked(other, [39 + 5j, 99 + 31j], 1) == asked(other, [28 + 16j, 28 + 20j], 1) == [True, True]

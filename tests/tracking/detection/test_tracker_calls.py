@@ -177,9 +177,9 @@ def test_a_refinement_far_from_the_pose_of_the_edges_is_refused(factor, status):
     fit = cast(PhotometricFit, lambda *_: SimpleNamespace(poses=lambda: [other]))
     tracker = CatheterTracker(WORLD.camera, THESIS, channels=ChannelOrder.RGB)
     tracker.refinement = fit
-    found = tracker(scenes()["plain"][1][None])[0]
-    assert found.status is status
-    assert found.answered or "the fit to the pixels moves the tip by" in found.reason
+    fitted = tracker(scenes()["plain"][1][None])[0]
+    assert fitted.status is status
+    assert fitted.answered or "the fit to the pixels moves the tip by" in fitted.reason
 
 
 def test_a_refinement_fits_all_poses_of_a_batch_at_once():
