@@ -7,9 +7,10 @@ from typing import Any
 import yaml
 
 from holotorch.experiments.config.errors import ConfigError, short
-from holotorch.io.bundled import similar_config
+from holotorch.io.bundled import similar_config, similar_path
 
 Key = tuple[str | int, ...]
+EXPERIMENT = "settings such as 'experiment: pec'"
 _MAX_BYTES = 1 << 17  # limit for a file; parsing that many bytes takes up to 4 s
 _MAX_VALUES = 100_000  # a file of _MAX_BYTES can have more values only through YAML aliases
 _MAX_DEPTH = 50  # levels of nested keys; configurations have fewer than ten
@@ -33,7 +34,7 @@ class Source:
         return f"{self.positions.get(parent, f'{self.path}:1:1')}: {name + ': ' if name else ''}{message}"
 
 
-def read_source(path: Path, overrides: list[str], wanted: str = "settings such as 'experiment: pec'") -> Source:
+def read_source(path: Path, overrides: list[str], wanted: str = EXPERIMENT) -> Source:
     """Read a YAML file and apply overrides ``key.sub=value`` to it. ConfigError with all mistakes that prevent reading.
 
     ``wanted`` describes in messages what such a file contains.
@@ -44,8 +45,10 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
         text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a UTF-8 text file"
-        if isinstance(error, FileNotFoundError) and (near := similar_config(path)):
-            reason = f"{reason}; did you mean {near}?"
+        if isinstance(error, FileNotFoundError):
+            # Bundled configurations are experiments: none of them is a camera that this file was meant to be.
+            near = similar_config(path) if wanted == EXPERIMENT else similar_path(path)
+            reason += f"; did you mean {near}?" if near else "" if wanted == EXPERIMENT else f"; expected {wanted}"
         raise ConfigError([f"{path}: cannot read the configuration: {reason}"]) from None
     if len(data) > _MAX_BYTES:
         size = f"more than {_MAX_BYTES} bytes"

@@ -26,6 +26,8 @@ _SURROUNDINGS = 6  # pixels to each side of a position; those on the border of t
 _LIKE_BAND = 0.7  # of the largest difference from the surroundings: from here on, a pixel counts as one of the band
 _FEW = 4  # pixels: where fewer about a position look like the band, the position probably lies beside it
 _SHOWN, _TILE = 20, 240  # pixels: the picture shows so many to each side of a place, in squares of so many
+_ACROSS = 0.5  # of the distance to the nearest band's place: where a colour continues so wide, it is no tube's
+_SAME, _SAME_LEAST = 0.4, 12  # of a colour's chroma, and levels: a pixel whose chroma differs by less shows this colour
 _UNEVEN = 25  # levels: deviation within a box above which it probably holds more than one band
 _BRIGHT = 250  # level from which on a channel is probably saturated
 _STAND_INS = ((200, 40, 45), (40, 70, 190))  # colours of neighbouring bands until theirs are read
@@ -95,7 +97,7 @@ def calibrate_catheter(
         f"Geometry   edges at {edges} mm from the tip, radius {1e3 * tool.radius:g} mm, length {1e3 * tool.length:g} mm"
         + (f"; {' and '.join(kept)} of {source}: measure yours and give --{' --'.join(kept)}" if kept else "")
     )
-    notes = _notes(places, boxes, levels, spread, counts)
+    notes = _notes(places, boxes, levels, spread, counts) + _beside(places, boxes, levels, pixels)
     if doubt := ambiguity_text(ambiguities(camera, catheter)):
         notes.append(doubt)
     shown = (
@@ -127,6 +129,41 @@ def _notes(
         for i, level in enumerate(levels, 1)
         if max(level) >= _BRIGHT
     ]
+    return notes
+
+
+def _beside(
+    places: Sequence[str],
+    boxes: Sequence[tuple[int, int, int, int]],
+    levels: Sequence[tuple[int, int, int]],
+    pixels: torch.Tensor,
+) -> list[str]:
+    """Bands whose colour does not end across the tube: their place lies beside it.
+
+    The tube runs through all places. From each, the colour must end on both sides within a part of the distance to the
+    next band, which is longer than the tube is wide.
+    """
+    centres = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2) for x0, y0, x1, y1 in boxes], dtype=torch.float64)
+    along = torch.linalg.svd(centres - centres.mean(0)).Vh[0]
+    across = torch.stack([-along[1], along[0]])
+    apart = torch.cdist(centres, centres).fill_diagonal_(float("inf")).amin(1)
+    smooth = functional.avg_pool2d(pixels.double()[None], 3, 1, 1, count_include_pad=False)[0]
+    limits = torch.tensor([smooth.shape[2], smooth.shape[1]])
+    notes = []
+    for i, (place, centre, level, width) in enumerate(zip(places, centres, levels, apart.tolist(), strict=True), 1):
+        steps = torch.arange(round(_ACROSS * width) + 1, dtype=torch.float64)[:, None]
+        wanted = torch.tensor(level, dtype=torch.float64) - sum(level) / 3
+        for side in (across, -across):
+            x, y = (line := (centre + steps * side).round().long()).unbind(1)
+            if len(line) == 1 or not ((line >= 0) & (line < limits)).all():
+                continue  # nothing to judge by
+            chroma = smooth[:, y, x].T - smooth[:, y, x].mean(0)[:, None]
+            if ((chroma - wanted).norm(dim=1) < max(_SAME_LEAST, _SAME * float(wanted.norm()))).all():
+                notes.append(
+                    f"band {i}: the colour at {place} continues for {len(line) - 1} pixels to one side, as that of "
+                    "something behind the tube would: does the place lie on the band? Look at the picture"
+                )
+                break
     return notes
 
 

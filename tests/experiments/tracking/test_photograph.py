@@ -101,6 +101,24 @@ def test_a_position_beside_a_band_is_noted(capsys):
     assert "catheter-bands.png" in out
 
 
+@pytest.mark.parametrize(("offset", "expected"), [((0, 0), False), ((0, 1), False), ((3, 12), True), ((-3, -12), True)])
+def test_a_position_on_the_cloth_beside_the_tube_is_noted(capsys, offset, expected):
+    """The cloth's colour goes on to a side where a band's would end; here the cloth is saturated enough for a band."""
+    world = World(size=SIZE, catheter=OTHER)
+    places = photograph(world)
+    picture = cv2.imread("bands.png")
+    assert picture is not None
+    grey = np.ptp(picture, -1) < 70
+    picture[grey] = (picture[grey] * np.array([0.4, 1.1, 0.5])).clip(0, 255)  # a green cloth
+    cv2.imwrite("bands.png", picture)
+    clicked = [(x + dx, y + dy) for (x, y), (dx, dy) in zip(places, ((0, 0), offset, (0, 0)), strict=True)]
+    assert main(["calibrate", "catheter", "bands.png", "--bands", *(f"{x},{y}" for x, y in clicked)]) == 0
+    out = capsys.readouterr().out
+    x, y = clicked[1]
+    assert (f"band 2: the colour at {x},{y} continues for" in out) is expected
+    assert "band 1: the colour" not in out and "band 3: the colour" not in out
+
+
 def test_lengths_are_given_with_the_photograph(capsys):
     """Of more bands than the dissertation's catheter has; what is not given is kept, and said to be."""
     picture = np.full((60, 120, 3), 128, np.uint8)

@@ -175,7 +175,10 @@ def test_a_recording_replays_to_the_same_poses(tmp_path, tracker, capsys):
     [
         ({"source": "missing.mp4"}, "no such video, folder or camera"),
         ({"camera": None}, "no camera is given: say which with --camera"),
-        ({"catheter": "gone.yaml"}, "gone.yaml: cannot read the configuration"),
+        (
+            {"catheter": "gone.yaml"},
+            "gone.yaml: cannot read the configuration: No such file or directory; expected the settings of a catheter",
+        ),
         ({"out": "in"}, "holds files already"),
     ],
 )
