@@ -24,7 +24,7 @@ from holotorch.tracking.detection.channels import ChannelOrder, as_levels, state
 from holotorch.tracking.detection.coarse import find_segments
 from holotorch.tracking.detection.colours import ColourTable
 from holotorch.tracking.detection.completion import complete_edges, lies_across
-from holotorch.tracking.detection.ends import shows_reversed
+from holotorch.tracking.detection.ends import shows_other_colour, shows_reversed
 from holotorch.tracking.detection.footprint import axis_on_plane, bulge_px, width_px
 from holotorch.tracking.detection.luma import fit_coarse_axis
 from holotorch.tracking.detection.measure import BLURRED, Edges, find_bands, halfway, measure_edges
@@ -464,16 +464,27 @@ class CatheterTracker(nn.Module):
             self.edges_px[-1] = torch.from_numpy(np.stack([pixels.real, pixels.imag], -1))
             self._agreeing(sampler, axis, edges, line_pose)
             pose = self._checked(line_pose, width, edges, sampler.height, cold=before is None)
-            lost = np.isnan(edges.t) & ~np.isin(np.arange(len(edges.t)), edges.outside)
-            if before is None and pose.status is Status.UNVERIFIED and lost.any():
-                # A stick with one band of another length shows three edges, too, and nothing hides the fourth.
-                expected = self._expected_edges(line_pose, axis.line)
-                if not all(self._crossed(sampler, axis, edges.t, float(at)) for at in expected[lost]):
-                    raise self._unexplained(lost)
-            if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
-                text = f"the tube goes on beyond its end on one side only: {_EXCHANGED}"
-                raise Refusal(Status.INCONSISTENT, text, final=True)
+            if before is None:
+                self._confirmed(sampler, axis, edges, line_pose, pose)
             return pose
+
+    def _confirmed(self, sampler: Sampler, axis: Axis, edges: Edges, line_pose: LinePose, pose: Pose) -> None:
+        """Refuse a pose of a search of the whole frame that only another object explains."""
+        missing = np.isnan(edges.t)
+        if missing.any():
+            expected = self._expected_edges(line_pose, axis.line)
+            lost = missing & ~np.isin(np.arange(len(missing)), edges.outside)
+            # A stick with one band of another length shows three edges, too, and nothing hides the fourth.
+            if pose.status is Status.UNVERIFIED and not all(
+                self._crossed(sampler, axis, edges.t, float(at)) for at in expected[lost]
+            ):
+                raise self._unexplained(lost)
+            if shows_other_colour(sampler, self.lens, axis, edges, expected, self.catheter):
+                text = "a band that shows one of its edges has another colour than the catheter's"
+                raise Refusal(Status.INCONSISTENT, text)
+        if shows_reversed(sampler, self.lens, line_pose, self.catheter):
+            text = f"the tube goes on beyond its end on one side only: {_EXCHANGED}"
+            raise Refusal(Status.INCONSISTENT, text, final=True)
 
     def _explained(
         self,

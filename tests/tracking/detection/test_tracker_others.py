@@ -8,10 +8,12 @@ import torch
 from tracked import SIZE, TRACKER, WORLD, at, refused, right, scenes, truth
 
 from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.detection.channels import ChannelOrder
 from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.catheter import THESIS, Catheter
 from holotorch.tracking.pose.status import Status
 from holotorch.tracking.simulation.render import Look
+from holotorch.tracking.simulation.varied import VariedWorld
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
 RED, GREEN, BLUE = THESIS.colours
@@ -40,6 +42,25 @@ def test_look_alikes_are_refused(kind):
         "other colours": (Status.NO_CATHETER, Status.BANDS_MISSING),
     }
     refused(TRACKER(case.frame()[None])[0], *expected.get(kind, (Status.INCONSISTENT,)))
+
+
+@pytest.mark.parametrize("seed", [376, 644, 987])
+def test_bands_in_another_order_of_which_one_is_not_seen_are_refused(seed):
+    """Three edges in their places: one more is outside, and bare tube is where the missing band should be."""
+    world = VariedWorld()
+    trial = world.negative(seed, "wrong order")
+    pose = CatheterTracker(trial.camera, world.catheter, channels=ChannelOrder.RGB)(trial.frame()[None])[0]
+    refused(pose, Status.INCONSISTENT)
+    assert "another colour" in pose.reason
+
+
+@pytest.mark.parametrize("seed", [2, 4, 8, 15, 30])
+def test_a_band_that_leaves_the_frame_keeps_its_colour(seed):
+    world = VariedWorld()
+    trial = world.trial(seed, "partial view")
+    pose = CatheterTracker(trial.camera, world.catheter, channels=ChannelOrder.RGB)(trial.frame()[None])[0]
+    assert pose.status is Status.UNVERIFIED, pose.reason
+    assert float((pose.tip - torch.as_tensor(trial.tip)).norm()) < 5 * float(pose.tip_sd)
 
 
 @pytest.mark.parametrize("roll", [25, 100])
