@@ -5,6 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from holotorch.correction.problem import FRAMES_AT_ONCE
 from holotorch.experiments.pec.budget import stop
@@ -157,6 +158,7 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
     """The measured kernel, and the Gaussian that fits it best."""
     kernel = experiment.array.crosstalk.kernel
     values = {"kernel": experiment.settings.modulator.kernel, "taps": list(kernel.shape), "total": kernel.sum().item()}
+    values["noise"] = _outer_noise(kernel)
     try:
         fitted = ThermalCrosstalk.fitted(kernel)
     except ValueError:  # a single pixel, or one that is as warm as its surroundings
@@ -167,9 +169,22 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
     return values | {"fitted_sigma_px": fitted.sigma_px, "fit_residual": residual}
 
 
+def _outer_noise(kernel: Tensor) -> float:
+    """Noise of the taps of a kernel [h, w], relative to its centre: of the outermost ring, where heat is least.
+
+    Heat spreads as far to one side as to the opposite one, so that opposite taps of the ring differ by noise alone.
+    """
+    ring = torch.ones_like(kernel, dtype=torch.bool)
+    ring[1:-1, 1:-1] = False
+    return (kernel - kernel.flip((0, 1)))[ring].square().mean().div(2).sqrt().item()
+
+
 _SAME_ASPECT = 0.01  # relative change of an aspect ratio that nobody sees
 _WARM = 0.02  # mean rise along a side of a measured kernel, relative to its centre, above which heat is missing
 _LITTLE = 1.0  # rad: of random phases that differ by less, over 0.9 of the light goes straight on (sinc^2(1/2))
+_NOISY = (
+    2e-4  # noise of a measured kernel above which it may be felt; a thousandth costs little, see correct_my_chip.md
+)
 _NO_GAUSSIAN = 0.05  # rest of a fit above which corrections for the Gaussian lose much of their gain
 
 
@@ -182,7 +197,12 @@ def _crosstalk_line(values: dict[str, Any]) -> str:
                 f"{values['fit_residual']:.2g} of it (rms)"
             )
             if values["fit_residual"] > _NO_GAUSSIAN:
-                line += ": where only a sigma can be given, no Gaussian represents this kernel"
+                line += ", more than noise: a sigma alone would not represent this kernel"
+        if (noise := values["noise"]) > _NOISY:
+            line += (
+                f"; opposite taps of its outermost ring differ as by noise of {noise:.1g} of the centre: "
+                f"report.kernel_noise={noise:.1g} tells what that costs"
+            )
         return line
     return (
         f"Crosstalk  heat spreads with sigma {values['sigma_px']:g} px over {values['taps']} taps "
