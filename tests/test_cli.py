@@ -44,7 +44,7 @@ HEAT = "Heat       "
 NO_LIMIT = HEAT + "no limit, as in the thesis: the hottest pixel is reported"
 SHARED = "700 / 589 / 494 degC above ambient of the colours, which share this limit"
 FOUR_PI = f"{HEAT}the phase after spreading stays below 12.57 rad, {SHARED}"
-RESPONSE = "; modulator.rad_per_K=0.01795 at 630 nm, the thesis's chip"
+RESPONSE = "; modulator.rad_per_K=0.01795 at 630 nm, that of the thesis's chip: give yours"
 FRAMES = "Frames     4, shown in turn and solved for {}; the eye sees their mean"
 
 

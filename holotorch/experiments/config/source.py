@@ -14,7 +14,7 @@ EXPERIMENT = "settings such as 'experiment: pec'"
 _MAX_BYTES = 1 << 17  # limit for a file; parsing that many bytes takes up to 4 s
 _MAX_VALUES = 100_000  # a file of _MAX_BYTES can have more values only through YAML aliases
 _MAX_DEPTH = 50  # levels of nested keys; configurations have fewer than ten
-_BY_NAME = {"transfer": "preset"}  # sections that may be given as the value of one of their keys
+_BY_NAME = {"transfer": "preset", "solver": "kind"}  # sections that may be given as the value of one of their keys
 
 
 @dataclass

@@ -12,7 +12,8 @@ from holotorch.experiments.planning.correction import HEAT, PROPAGATION, STOPPIN
 from holotorch.experiments.planning.tolerance import Budget, Part
 from holotorch.modulator import ThermalCrosstalk
 
-COARSE_PLANES = 0.5  # error of representing a volume by planes above which a run notes it
+# Error of representing a volume by planes above which thin parts break, and above which only slices are left.
+FEW_PLANES, COARSE_PLANES = 0.15, 0.5
 SLABS = "planes"  # part with the error of representing slabs of the volume by planes
 PATIENCE = 10  # small changes of the loss in a row after which the solver stops, with a tolerance
 _COUNTS = (5, 8, 12, 16, 24, 32, 48, 64)  # numbers of planes to choose from
@@ -48,7 +49,7 @@ def choose_planes(settings: JointSettings, slab_error: Callable[[int], float]) -
     given = settings.display.planes
     if given is not None or settings.tolerance is None:
         return PLANES if given is None else given
-    most = min(settings.frames, _COUNTS[-1]) if "slabs" in settings.report.baselines else _COUNTS[-1]
+    most = min(settings.frames, _COUNTS[-1]) if "slabs" in settings.comparisons else _COUNTS[-1]
     counts, share = [count for count in _COUNTS if count < most] + [most], _begun(settings, 0.0, 0.0).share(SLABS)
     return next((count for count in counts if slab_error(count) <= share), most)
 

@@ -26,6 +26,7 @@ REFERENCE = 630e-9  # metres, wavelength of ``display.rad_per_K``
 PLANES = 5  # number of planes of a run without tolerance, if it is not stated
 FOCI_PER_STEP = 2  # foci of the whole pupil that each step takes, if it takes some of the views
 Baseline = Literal["random", "afterwards", "unheated", "light_field", "retrieved", "retrieved_pec", "slabs"]
+BASELINES: tuple[Baseline, ...] = ("random", "afterwards", "slabs")  # of a run that names none
 
 
 class DisplaySettings(GridSettings):
@@ -84,10 +85,10 @@ class JointReport(Settings):
     heat, then corrected for it. ``light_field``: the same by Adam for a single random view in each step, a whole pupil
     or a smaller one. ``retrieved``: Gerchberg-Saxton phase retrieval over all views, heat ignored;
     ``retrieved_pec``: the same with a deconvolution in each pass (thesis Algorithm 1). ``slabs``: each frame shows one
-    plane of the volume, as in thesis Fig. 4.18.
+    plane of the volume, as in thesis Fig. 4.18; a run that names none leaves it out if frames are fewer than planes.
     """
 
-    baselines: Annotated[tuple[Baseline, ...], BeforeValidator(several)] = ("random", "afterwards", "slabs")
+    baselines: Annotated[tuple[Baseline, ...], BeforeValidator(several)] = BASELINES
 
 
 class JointSettings(Settings):
@@ -136,6 +137,18 @@ class JointSettings(Settings):
             return display.max_phase
         return display.max_temperature * display.rad_per_K * REFERENCE / max(self.wavelengths)
 
+    @property
+    def comparisons(self) -> tuple[Baseline, ...]:
+        """``report.baselines``; of the default ones without "slabs", if frames are too few for it."""
+        names = self.report.baselines
+        few = names == BASELINES and self.frames < _least_planes(self)
+        return tuple(name for name in names if not (few and name == "slabs"))
+
+
+def _least_planes(settings: JointSettings) -> int:
+    """Planes that a run has at least."""
+    return settings.display.planes or (PLANES if settings.tolerance is None else 1)
+
 
 def volume_settings(settings: JointSettings, planes: int | None = None) -> dict[str, Any]:
     """The same scene as settings of kind ``volume``, with ``planes`` in place of the number in the settings."""
@@ -169,13 +182,12 @@ def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
     if min(display.pitch) < 0.9 * max(settings.wavelengths):
         least = f"at least 0.9 of the longest wavelength, {0.9 * max(settings.wavelengths):.3g} m"
         problems.append((("display", "pitch"), f"expected {least}, got {min(display.pitch):g} m"))
-    planes = display.planes or (PLANES if settings.tolerance is None else 1)
-    if "slabs" in settings.report.baselines and settings.frames < planes:
+    planes = _least_planes(settings)
+    if "slabs" in settings.comparisons and settings.frames < planes:
         others = ", ".join(name for name in settings.report.baselines if name != "slabs")
-        cure = f"use {planes} frames, or leave it out: 'report.baselines=[{others}]'"
-        chosen = "baselines" in settings.report.model_fields_set
+        cure = f"leave it out: 'report.baselines=[{others}]', or use {planes} frames, in as many times the time"
         words = f"the comparison 'slabs' shows one plane a frame, here {planes} planes, got {settings.frames} frames"
-        problems.append((("report", "baselines") if chosen else ("frames",), f"{words}; {cure}"))
+        problems.append((("report", "baselines"), f"{words}; {cure}"))
     return problems + _sampling(settings)
 
 

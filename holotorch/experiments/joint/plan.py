@@ -5,13 +5,13 @@ from typing import Any
 
 import torch
 
-from holotorch.experiments.joint.budget import COARSE_PLANES, PATIENCE, SLABS, stop
+from holotorch.experiments.joint.budget import COARSE_PLANES, FEW_PLANES, PATIENCE, SLABS, stop
 from holotorch.experiments.joint.config import REFERENCE, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
-from holotorch.experiments.volume.plan import cut_off, dark_picture, viewpoint
+from holotorch.experiments.volume.plan import cut_off, dark_picture, preset_note, viewpoint
 from holotorch.optics.light.coherence import depth_of_focus
 
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
@@ -75,7 +75,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient{memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the pupil",
-        f"Solver     {_steps(values, experiment)}; compared with {', '.join(settings.report.baselines) or 'nothing'}",
+        f"Solver     {_steps(values, experiment)}; compared with {_compared(settings)}",
         f"{experiment.budget.text}; {values['taps']} taps, {values['precision']} in the solver",
         f"Cost       about {duration(values['predicted_seconds'])} ({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
@@ -93,6 +93,13 @@ def _steps(values: dict[str, Any], experiment: JointExperiment) -> str:
     return f"L-BFGS, at most {settings.steps} steps, until {few}"
 
 
+def _compared(settings: JointSettings) -> str:
+    few = (
+        " (slabs, one plane a frame, needs as many frames)" if settings.comparisons != settings.report.baselines else ""
+    )
+    return (", ".join(settings.comparisons) or "nothing") + few
+
+
 def _temperatures(settings: JointSettings) -> str:
     """Temperature of the hottest pixel that the limit allows, for each wavelength."""
     response = [settings.display.rad_per_K * REFERENCE / wavelength for wavelength in settings.wavelengths]
@@ -108,7 +115,7 @@ def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
     """The least of 2, 4 and 8 times as many planes that are close enough to the volume, else 8 times, and its error."""
     count, error = len(experiment.foci), math.inf
     for factor in (2, 4, 8):
-        if error > COARSE_PLANES:
+        if error > FEW_PLANES:
             count = factor * len(experiment.foci)
             more = with_planes(experiment.scene, experiment.settings, count)
             error = more.sampler().slab_error(more.volume)
@@ -118,14 +125,15 @@ def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
 def _notes(experiment: JointExperiment) -> list[str]:
     settings, foci = experiment.settings, experiment.foci
     notes = dark_picture(experiment.scene) + cut_off(experiment.scene, "array")
-    if (error := experiment.budget.error(SLABS)) > COARSE_PLANES:
+    if words := preset_note(experiment.scene):
+        notes.append(words)
+    if (error := experiment.budget.error(SLABS)) > FEW_PLANES:
         more, left = _more_planes(experiment)
-        # The comparison "slabs" shows one plane in each frame.
-        more_frames = f" frames={more}" if "slabs" in settings.report.baselines else ""
+        shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
         still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
         notes.append(
-            f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show "
-            f"slices of it; display.planes={more}{more_frames} would be {left:.0%} off{still}"
+            f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show {shown}; "
+            f"display.planes={more} would be {left:.0%} off, in about {more / len(foci):.2g} times the time{still}"
         )
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
     if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from holotorch.experiments.joint.budget import COARSE_PLANES
+from holotorch.experiments.joint.budget import COARSE_PLANES, FEW_PLANES
 from holotorch.experiments.joint.names import NAMES, SETS
 from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
@@ -32,10 +32,11 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
         best = max(others, key=others.__getitem__)
         scores.append(f"the best other method, {NAMES[best]}: {others[best]:.1f} dB at the corrected foci")
     error, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), []
-    if error > COARSE_PLANES:
+    if error > FEW_PLANES:
+        shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
         notes.append(
-            f"Warning    the planes are {error:.0%} off the volume: they show slices of it, and the PSNR is that of "
-            "these; more of them (display.planes) come closer"
+            f"Warning    the planes are {error:.0%} off the volume: they show {shown}, and the PSNR is that of "
+            "their pictures; more of them (display.planes) come closer"
         )
     return [*notes, f"Result     PSNR {'; '.join(scores)}", *error_line(summary)]
 

@@ -35,7 +35,7 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
     """
     if process_count()[0] > 0:
         experiment.solve(resume=from_first(None))
-        for name in experiment.settings.report.baselines:
+        for name in experiment.settings.comparisons:
             if name in SHARED:
                 baseline(experiment, name)
         return True
@@ -56,7 +56,7 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
         shown = {"joint": show(experiment, solution.x.float())}
         files.write(save_array, out / "arrays" / "phase.npy", shown["joint"].phase)
     seconds = {"joint": log.seconds}
-    for name in experiment.settings.report.baselines:
+    for name in experiment.settings.comparisons:
         try:
             if not pressed:
                 shown[name], seconds[name] = timed(lambda name=name: baseline(experiment, name))

@@ -80,8 +80,8 @@ def seconds_of(experiment: JointExperiment, machine: Machine) -> dict[str, float
     wanted = 7 * planes - 1 + settings.eye.parallax + sweep
     scores = machine.score(colours * planes * pixels, double=False) * scored / planes
     evaluated = _SHOWN * fields * scored * transform + scores
-    wanted += CIRCLES if "light_field" in settings.report.baselines else 0
-    others, shown = settings.report.baselines, 2 + len(settings.report.baselines)
+    wanted += CIRCLES if "light_field" in settings.comparisons else 0
+    others, shown = settings.comparisons, 2 + len(settings.comparisons)
     pictures = 2 * _SWEEP_PIXEL * pixels * max(1, 2 * sweep - 2) + _PANEL * shown * (planes + 4)
     return {
         "wanted images": _WANTED * colours * planes * wanted * transform,

@@ -134,6 +134,11 @@ class _SolverSettings(Settings):
     reruns: Annotated[int, BeforeValidator(number), Field(ge=0, le=20)] = 0
 
 
+def _by_kind(value: Any) -> Any:
+    """``solver: lbfgs`` for ``solver: {kind: lbfgs}``."""
+    return {"kind": value} if isinstance(value, str) else value
+
+
 class APGSettings(_SolverSettings):
     """Accelerated proximal gradient, thesis Algorithm 2; options as in ``holotorch.correction.APG``."""
 
@@ -193,7 +198,9 @@ class PECSettings(Settings):
     propagator: Annotated[FraunhoferSettings | NearFieldSettings, Field(discriminator="kind")]
     frames: Annotated[Count, Field(le=64)] = 1
     multiplexing: Literal["joint", "independent"] = "joint"
-    solver: Annotated[APGSettings | AdamSettings | LBFGSSettings, Field(discriminator="kind")]
+    solver: Annotated[
+        APGSettings | AdamSettings | LBFGSSettings, Field(discriminator="kind"), BeforeValidator(_by_kind)
+    ]
     report: ReportSettings = ReportSettings()
 
 
@@ -228,7 +235,7 @@ def contradictions(settings: PECSettings) -> Iterator[tuple[Key, str]]:
         yield ("modulator", "kernel_size"), "a measured kernel has the size of its file; leave this out"
     for name in ("max_phase", "max_temperature"):
         if getattr(chip, name) is not None and settings.solver.kind != "lbfgs":
-            message = "only the solver lbfgs keeps a limit; use 'solver={kind: lbfgs}', or leave it out"
+            message = "only the solver lbfgs keeps a limit; use solver=lbfgs, or leave it out"
             yield ("modulator", name), message
     if chip.max_phase is not None and chip.max_temperature is not None:
         yield ("modulator", "max_temperature"), "expected one limit, max_phase or max_temperature"

@@ -233,7 +233,11 @@ def _heat(experiment: PECExperiment) -> str:
     limit, bits = experiment.limit, experiment.settings.modulator.bits
     chip = experiment.settings.modulator
     steps = "" if bits is None else f"; heaters with {2**bits} steps"
-    thesis = ", the thesis's chip" if chip.rad_per_K == type(chip).model_fields["rad_per_K"].default else ""
+    thesis = (
+        ", that of the thesis's chip: give yours"
+        if chip.rad_per_K == type(chip).model_fields["rad_per_K"].default
+        else ""
+    )
     steps += f"; modulator.rad_per_K={chip.rad_per_K:.4g} at 630 nm{thesis}"
     if limit is None:
         return "no limit, as in the thesis: the hottest pixel is reported" + steps

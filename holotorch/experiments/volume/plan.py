@@ -187,9 +187,12 @@ def preset_note(experiment: VolumeExperiment) -> str:
     if experiment.preset_range is None:
         return ""
     low, high = experiment.preset_range
+    transfer = experiment.transfer
+    hidden = float(transfer.positions[max(0, int((transfer.opacities > 0).to(torch.uint8).argmax()) - 1)])
     return (
-        f"the preset {experiment.settings.transfer.preset} lies between {low:.6g} and {high:.6g}, from the histogram; "
-        "look at it with holotorch check --preview, and give transfer.low and transfer.high for other values"
+        f"the preset {experiment.settings.transfer.preset} lies between {low:.3g} and {high:.3g}, from the histogram, "
+        f"and shows nothing of values below {hidden:.3g}: look at it with holotorch check --preview; a lower "
+        "transfer.low with transfer.high shows more"
     )
 
 

@@ -171,7 +171,7 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         ("modulator.bits=2.5", "modulator.bits: expected a whole number, got 2.5"),
         (
             "modulator.max_phase=9",
-            "modulator.max_phase: only the solver lbfgs keeps a limit; use 'solver={kind: lbfgs}",
+            "modulator.max_phase: only the solver lbfgs keeps a limit; use solver=lbfgs",
         ),
         ("frames=0", "frames: expected greater than or equal to 1, got 0"),
         ("frames=65", "frames: expected less than or equal to 64, got 65"),

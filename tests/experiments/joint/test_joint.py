@@ -177,12 +177,19 @@ def test_a_focus_at_the_array_is_taken_and_a_plane_behind_it_is_not():
     assert near.stack.images.isfinite().all()
 
 
+def test_the_default_comparison_with_slabs_is_left_out_where_frames_are_too_few(capsys):
+    words = ["check", TEAPOT, SCENE, "view={width: 0.3 mm}", DISPLAY]
+    assert main([*words, "frames=4"]) == main([*words, "frames=2"]) == 0
+    enough, few = (line for line in capsys.readouterr().out.splitlines() if line.startswith("Solver"))
+    assert enough.endswith("compared with random, afterwards, slabs")
+    assert few.endswith("compared with random, afterwards (slabs, one plane a frame, needs as many frames)")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["display.depth=13 mm"], "less than twice the distance, 0.012 m"),
         (["frames=2", "report.baselines=[slabs]"], "report.baselines: the comparison 'slabs' shows one plane a frame"),
-        (["frames=2"], "frames: the comparison 'slabs' shows one plane a frame, here 4 planes, got 2 frames; use 4"),
         (["wavelengths=[]"], "expected 1 (grey), 3 (red, green, blue) or another number, got 0"),
         (["display.pitch=0.4 um"], "at least 0.9 of the longest wavelength"),
         (["display.distance=0.1 mm", "display.depth=null"], "display.distance: expected the whole volume in front"),

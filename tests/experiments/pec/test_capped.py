@@ -117,7 +117,7 @@ def test_solvers_that_keep_no_limit_are_refused(solver):
     assert len(caught.value.mistakes) == 1
     assert caught.value.mistakes[0].startswith(f"{CONFIG}:")
     assert caught.value.mistakes[0].endswith(
-        "modulator.max_phase: only the solver lbfgs keeps a limit; use 'solver={kind: lbfgs}', or leave it out"
+        "modulator.max_phase: only the solver lbfgs keeps a limit; use solver=lbfgs, or leave it out"
     )
 
 
