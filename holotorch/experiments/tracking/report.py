@@ -77,6 +77,7 @@ class Log:
     seconds: list[float] = field(default_factory=list)  # time of the tracker for each frame that could be read
     stages: list[dict[str, float]] = field(default_factory=list)  # seconds of each stage of the tracker, by frame
     pictures: dict[str, str] = field(default_factory=dict)  # captions of the overlays by status
+    beyond: int = 0  # frames in which the tube goes on beyond the tip of the pose
     # Refused frames and the first of them, by status and reason without its numbers.
     refused: dict[tuple[str, str], tuple[int, str]] = field(default_factory=dict)
 
@@ -134,6 +135,11 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
             {"stage": name, "milliseconds": 1e3 * mean, "percent": 100 * mean / total} for name, mean in means.items()
         ]
     notes = list(frames.notes)
+    if 2 * log.beyond > answered:
+        notes.append(
+            f"wrong tips: in {log.beyond} of {answered} poses the tube goes on beyond the tip; are `edges` counted "
+            "from the tip, in their order, and the bands named from the tip on?"
+        )
     if still:
         try:
             stability = s_rms(torch.tensor(log.tips, dtype=torch.float64))

@@ -41,6 +41,8 @@ from holotorch.io.files import append, replacing, without_nan, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
 from holotorch.tracking import Pose, Status
+from holotorch.tracking.camera.numpy_lens import Lens
+from holotorch.tracking.detection.ends import shows_beyond_tip
 from holotorch.tracking.pose.alignment import in_frame
 from holotorch.tracking.pose.overlay import overlay
 from holotorch.tracking.streaming.packet import now
@@ -263,7 +265,7 @@ def _track_all(
     opened: list[AbstractContextManager[Any]],
 ) -> None:
     """Track all frames and write the results until a signal arrives; the files it opens are appended to ``opened``."""
-    folder, frames, settings = run.path, inputs.frames, experiment.settings
+    folder, frames, settings, lens = run.path, inputs.frames, experiment.settings, Lens(inputs.camera)
 
     def entered(context: AbstractContextManager[Entered]) -> Entered:
         value = context.__enter__()
@@ -297,6 +299,8 @@ def _track_all(
             if movie and drawn is not None:
                 movie.write(drawn)
             log.take(item, drawn)
+            if item.frame.pixels is not None and item.pose.answered:
+                log.beyond += shows_beyond_tip(item.frame.pixels, lens, item.pose, inputs.catheter)
             bar.set_postfix_str(f"{item.status.name}, {1e3 * item.seconds:.1f} ms", refresh=False)
             bar.update()
         if run.signals:

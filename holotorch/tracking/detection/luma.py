@@ -162,6 +162,8 @@ def _stands_out(luma: np.ndarray, band: np.ndarray, width: float) -> np.ndarray:
     """[S] whether the luma [S, U] of each station's band differs from that on both sides of a tube of ``width``."""
     tube, background = tube_and_background(luma.shape[1], width)
     one = np.arange(luma.shape[1]) < luma.shape[1] // 2
+    if not background.any():  # a tube that seems as wide as the samples
+        return np.zeros(len(luma), dtype=bool)
     own, left, right = (luma[:, part].mean(1) for part in (tube, background & one, background & ~one))
     member = band[:, None] == band
     differs = [np.abs(member @ (own - side)) / member.sum(1) > _CONTRAST for side in (left, right)]

@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,13 @@ from stand_in import track
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking import run as tracking_run
 from holotorch.experiments.tracking import synthetic
-from holotorch.experiments.tracking.devices import build_camera, build_catheter, load_camera, load_catheter
+from holotorch.experiments.tracking.devices import (
+    build_camera,
+    build_catheter,
+    load_camera,
+    load_catheter,
+    save_catheter,
+)
 from holotorch.experiments.tracking.forecast import HALF, working_range
 from holotorch.experiments.tracking.synthetic import (
     RATE,
@@ -124,6 +131,17 @@ def test_a_run_of_a_synthetic_recording_holds_its_errors(folder, tmp_path):
     page = (out / "report.html").read_text()
     assert "not known here" not in page and f"{found['p95_mm']:.3f}" in page and "95 % ellipsoid" in page
     assert "<td>stability</td>" not in page
+
+
+@pytest.mark.parametrize(("offset", "wrong"), [(0.0, False), (-6e-3, True)])
+def test_a_tube_that_goes_on_beyond_the_tip_is_noted(folder, tmp_path, offset, wrong):
+    """Edges counted from a point behind the tip fit as well as the right ones."""
+    catheter = tmp_path / "catheter.yaml"
+    save_catheter(catheter, replace(THESIS, edges=tuple(edge + offset for edge in THESIS.edges)))
+    out, _ = track(tmp_path / "run", folder, video=False, catheter=str(catheter))
+    told = json.loads((out / "summary.json").read_text())
+    assert told["answered"] == 3
+    assert any("wrong tips: in 3 of 3 poses" in note for note in told["notes"]) is wrong
 
 
 def test_other_tables_of_that_name_and_frames_beyond_it_are_left_out(tmp_path):

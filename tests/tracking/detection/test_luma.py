@@ -1,6 +1,7 @@
 """Whether a codec has halved the colours' resolution, and where edges lie by what it has left: their luma."""
 
 import math
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -322,3 +323,9 @@ def test_patches_end_at_the_frames_border():
     other[:, :, right:] = other[:, :, right::2].repeat_interleave(2, -1)
     assert asked(other, [-50 + 5j, 0j, 12 + 12j, 12 + 90j], 1) == [False] * 4
     assert asked(other, [39 + 5j, 99 + 31j], 1) == asked(other, [28 + 16j, 28 + 20j], 1) == [True, True]
+
+
+def test_a_tube_as_wide_as_the_samples_does_not_stand_out():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a mean over no sample is one
+        assert not luma._stands_out(np.ones((4, 9)), np.zeros(4, dtype=int), 30.0).any()
