@@ -48,7 +48,8 @@ def read_source(path: Path, overrides: list[str], wanted: str = EXPERIMENT) -> S
         if isinstance(error, FileNotFoundError):
             # Bundled configurations are experiments: none of them is a camera that this file was meant to be.
             near = similar_config(path) if wanted == EXPERIMENT else similar_path(path)
-            reason += f"; did you mean {near}?" if near else "" if wanted == EXPERIMENT else f"; expected {wanted}"
+            hint = f"; did you mean {near}?" if near else "" if wanted == EXPERIMENT else f"; expected {wanted}"
+            reason = f"{reason}{hint}"
         raise ConfigError([f"{path}: cannot read the configuration: {reason}"]) from None
     if len(data) > _MAX_BYTES:
         size = f"more than {_MAX_BYTES} bytes"
