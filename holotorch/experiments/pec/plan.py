@@ -111,11 +111,11 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     if len(settings.wavelengths) > 1:  # a single one shows the luminance
         lines += colours_in_words("picture", settings.wavelengths)
     if "distance_mm" in physics:
+        periodic = f"; the periodic model is alias-free up to {_listed(physics['alias_free_mm'])} mm"
         lines.append(
             f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot of each colour"
             f"{', at the farthest,' if len(physics['distance_mm']) > 1 else ''} {_listed(physics['spot_um'])} um, "
-            f"sampled every {physics['pitch_um'][1]:.4g} um; the periodic model is alias-free up to "
-            f"{_listed(physics['alias_free_mm'])} mm"
+            f"sampled every {physics['pitch_um'][1]:.4g} um{'' if experiment.isolated else periodic}"
         )
     if planned := values.get("single_propagation"):
         lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
@@ -221,7 +221,7 @@ def _framing(experiment: PECExperiment) -> str:
         how = f"padded with black {'above and below' if wide else 'on both sides'}"
     else:
         how = f"cropped {'on both sides' if wide else 'above and below'}; target.fit=pad shows all of it"
-    return f"; of {height} x {width} px, {how}"
+    return f"; of {height} rows and {width} columns, {how}"
 
 
 def _listed(values: list[float], form: str = ".3g") -> str:
