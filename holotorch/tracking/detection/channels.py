@@ -115,10 +115,9 @@ def ambiguity_text(orders: Sequence[ChannelOrder]) -> str:
     """Message for the user about ambiguous orders, with a remedy; empty if there are none."""
     names = " or ".join(order.value for order in orders)
     return names and (
-        f"frames with channels in the order {names} show this catheter in another pose, with a small stated "
-        "deviation, which only the tube beyond the bands can refute, if it is on the frame: make sure that red objects "
-        "are red in the frames, or paint bands whose colours differ in every order of the channels, as in "
-        "configs/tracking/catheter_distinct.yaml"
+        f"frames in the order {names} show this catheter in another pose, which only the tube beyond the bands can "
+        "refute: red objects must be red in the frames; bands as in configs/tracking/catheter_distinct.yaml are safe "
+        "in every order"
     )
 
 
