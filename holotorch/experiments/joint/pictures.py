@@ -15,6 +15,7 @@ from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_animation
 from holotorch.optics.picture import tone_map
 
+_COLUMNS = 8  # largest number of foci whose pictures stand side by side
 SWEEP = 17  # foci of the animated sweep
 _SECONDS = 0.12  # seconds for which each of them is shown
 
@@ -26,16 +27,20 @@ def write(
     images: dict[str, dict[str, Tensor]],
     files: Results,
 ) -> None:
-    """Write all pictures; ``images`` has the images [C, V, H, W] of each method and set of views."""
+    """Write all pictures; ``images`` has the images [C, V, H, W] of each method and set of views.
+
+    Of many foci, pictures of a few that are evenly spaced stand side by side.
+    """
     wanted = {"stack": experiment.stack.images, "half": experiment.halves.images}
     peak = (wanted["stack"] * experiment.colours).amax().cpu()
     foci = [f"{focus * 1e3:.4g} mm" for focus in experiment.foci]
     sides = [f"{half}, {focus}" for focus in foci for half in ("left", "right")]
-    for name, key, titles in (("stack", "stack", foci), ("parallax", "half", sides[:2] + sides[-2:])):
-        pick = list(range(len(foci))) if key == "stack" else [0, 1, len(sides) - 2, len(sides) - 1]
+    some = torch.linspace(0, len(foci) - 1, min(len(foci), _COLUMNS)).round().long().tolist()
+    ends = [0, 1, len(sides) - 2, len(sides) - 1]
+    for name, key, titles, pick in (("stack", "stack", foci, some), ("parallax", "half", sides, ends)):
         rows = {"wanted": wanted[key]} | {NAMES[method]: each[key] for method, each in images.items()}
         pixels = {label: picture(experiment, each, peak)[:, pick] for label, each in rows.items()}
-        files.write(write_bytes, folder / f"{name}.png", figures.picture_table(pixels, titles))
+        files.write(write_bytes, folder / f"{name}.png", figures.picture_table(pixels, [titles[i] for i in pick]))
     files.write(write_bytes, folder / "sweep.png", sweep(experiment, shown["joint"], peak))
     phase = shown["joint"].phase
     assert phase is not None

@@ -22,6 +22,7 @@ from holotorch.experiments.joint.experiment import build
 from holotorch.experiments.joint.methods import Shown, baseline, show
 from holotorch.experiments.joint.report import joint_section
 from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs import figures
 from holotorch.hologram import incoherent_views
 from holotorch.optics import View, disc_source
 from holotorch.scene import SourceLayers
@@ -241,6 +242,20 @@ def test_a_run_has_its_tables_and_pictures_and_can_be_exported(tmp_path, capsys)
     panel.append("calibration=[{wavelength: 636 nm}, {wavelength: 520 nm}, {wavelength: 455 nm}]")
     assert main(["export-slm", str(folder), *panel, "--out", str(tmp_path / "slm")]) == 0
     assert "9 png for" in capsys.readouterr().out  # three frames of three colours
+
+
+def test_pictures_of_many_foci_are_a_few(tmp_path, monkeypatch):
+    drawn: dict[str, tuple[int, list[str]]] = {}
+
+    def table(rows, titles):
+        drawn[str(len(drawn))] = rows["wanted"].shape[1], titles
+        return b"png"
+
+    monkeypatch.setattr(figures, "picture_table", table)
+    words = [*("display.planes=15", "frames=1", "steps=1", "wavelengths=[520 nm]"), SCENE, VOLUME[1], *PLAIN, DISPLAY]
+    words = [*words[4:], *words[:4]]
+    assert execute(load_config(TEAPOT, words), tmp_path / "a", "a")[1]
+    assert drawn["0"] == (8, [f"{each:.4g} mm" for each in (2.267, 3.333, 4.4, 5.467, 6.533, 7.6, 8.667, 9.733)])
 
 
 def test_anybody_can_compute_the_pictures_of_a_run_from_its_files(tmp_path):
