@@ -217,7 +217,7 @@ def _notes(grid: Grid, wavelength: float, nearest: float, near: bool) -> tuple[s
         notes.append(
             "pixels bend light up to a largest angle only: the light of each point is a cone, which at this distance "
             "may fill only part of the hologram; how its edge is defined (hologram.cone) then changes the field by "
-            "more than the tolerance, by up to tens of percent"
+            "more than the tolerance, by up to tens of percent: state it where fields of other software are compared"
         )
     if min(grid.pitch) <= wavelength / 2:
         notes.append("the pitch is at or below half a wavelength: light leaves in every direction")

@@ -43,10 +43,10 @@ def similar_config(path: Path) -> Path | None:
 
     It is one of the neighbours, or else a bundled one with this name in another folder.
     """
-    names = {each.name for candidate in _candidates(path) for each in candidate.parent.glob("*.yaml")}
-    near = difflib.get_close_matches(path.name, sorted(names), 1)
+    names = {each.stem: each.name for candidate in _candidates(path) for each in candidate.parent.glob("*.yaml")}
+    near = difflib.get_close_matches(path.stem, sorted(names), 1)  # with the suffix, any two names would be similar
     if near:
-        return path.with_name(near[0])
+        return path.with_name(names[near[0]])
     for folder in (package / "configs" for package in Path(__file__).parents[1:3]):
         for same in folder.rglob("*.yaml"):
             if same.stem == path.stem:

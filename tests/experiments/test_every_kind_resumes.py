@@ -180,7 +180,7 @@ def test_two_runs_never_share_a_folder(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(perception_layout, "_picture", meanwhile)
     assert main(command("layout", tmp_path / "a")) == 0 and codes == [2, 2]
-    assert capsys.readouterr().err.count("is in use by another run; choose another --out") == 2
+    assert capsys.readouterr().err.count("is in use by another run: wait for its end, or choose another --out") == 2
 
 
 def test_what_a_kill_at_the_start_leaves_is_no_obstacle(tmp_path):

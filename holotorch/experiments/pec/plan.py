@@ -182,9 +182,8 @@ def _outer_noise(kernel: Tensor) -> float:
 _SAME_ASPECT = 0.01  # relative change of an aspect ratio that nobody sees
 _WARM = 0.02  # mean rise along a side of a measured kernel, relative to its centre, above which heat is missing
 _LITTLE = 1.0  # rad: of random phases that differ by less, over 0.9 of the light goes straight on (sinc^2(1/2))
-_NOISY = (
-    2e-4  # noise of a measured kernel above which it may be felt; a thousandth costs little, see correct_my_chip.md
-)
+_NOISY = 2e-4  # noise of a measured kernel above which it is stated; a thousandth costs little (correct_my_chip.md)
+_FEW_SPOTS = 0.1  # width of a spot, relative to the array, from which on hardly ten of them lie side by side
 _NO_GAUSSIAN = 0.05  # rest of a fit above which corrections for the Gaussian lose much of their gain
 
 
@@ -290,6 +289,11 @@ def _notes(experiment: PECExperiment) -> list[str]:
         spot = longest * farthest / min(grid.extent)
         if spot > 1.5 * max(grid.pitch):
             nearer = farthest * max(grid.pitch) / spot
+            if (share := spot / min(grid.extent)) > _FEW_SPOTS:
+                notes.append(
+                    f"Warning: at {farthest * 1e3:.4g} mm a spot is {share:.2g} times as wide as the array, which "
+                    "forms no picture there"
+                )
             notes.append(
                 f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "
                 f"detail of the picture cannot be formed; a sample is resolved up to {nearer * 1e3:.3g} mm "

@@ -151,7 +151,9 @@ def _locked(folder: Path) -> Iterator[None]:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise ConfigError([f"{folder} is in use by another run; choose another --out"]) from None
+                raise ConfigError(
+                    [f"{folder} is in use by another run: wait for its end, or choose another --out"]
+                ) from None
         yield
     finally:
         os.close(handle)

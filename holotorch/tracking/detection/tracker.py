@@ -103,7 +103,7 @@ _NEAR = (
 )
 _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
 _CONFIRMED = 5.0  # standard deviations of both by which a fit to the pixels may differ from the pose of the edges
-_EXCHANGED = "exchanged red and blue channels (ChannelOrder), or bands not named from the tip on, can cause this"
+_EXCHANGED = "bands not named from the tip on, or exchanged red and blue channels (ChannelOrder), can cause this"
 
 
 class CatheterTracker(nn.Module):

@@ -283,6 +283,9 @@ def test_single_values_stand_for_lists(written):
 def test_missing_and_binary_files(tmp_path):
     with pytest.raises(ConfigError, match="cannot read the configuration: No such file or directory$"):
         load_config(tmp_path / "missing.yaml")
+    (tmp_path / "otherend.yaml").write_text(GOOD)  # similar to the next name by its suffix alone
+    with pytest.raises(ConfigError, match="No such file or directory$"):
+        load_config(tmp_path / "head.yaml")
     # A bundled configuration is named as it was asked for, wherever its file lies.
     with pytest.raises(ConfigError, match=r"directory; did you mean configs/pec/fourier\.yaml\?$"):
         load_config("configs/pec/fourrier.yaml")

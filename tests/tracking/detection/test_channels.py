@@ -88,9 +88,7 @@ def test_a_previous_pose_tells():
     right(TRACKER(frame[None], before)[0], case)
     pose = TRACKER(reordered(frame, ChannelOrder.BGR)[None], before)[0]
     refused(pose, Status.BANDS_MISSING)
-    assert pose.reason.startswith(
-        "the bands lie along the previous line, in the other direction: exchanged red and blue"
-    )
+    assert pose.reason.startswith("the bands lie along the previous line, in the other direction: bands not named")
     gone = TRACKER(WORLD.desk()[None], before)[0]  # and of a frame without them nothing of the kind is said
     assert not gone.answered and "direction" not in gone.reason
 
