@@ -1,6 +1,7 @@
 """A run of kind ``joint``: the solver, the methods it is compared with, and the files of the run folder."""
 
 import signal
+import sys
 import time
 from typing import Any
 
@@ -63,6 +64,8 @@ def run_joint(experiment: JointExperiment, opened: RunFolder) -> bool:
         except KeyboardInterrupt:
             pressed.append(signal.SIGINT)
     compared = None if pressed else measured_values(lambda: joint_errors(experiment, solution))
+    if pressed:  # of many planes this takes a minute or more
+        print("interrupted; what there is of the run is evaluated and saved before it ends", file=sys.stderr)
     with deferred(pressed):
         summary = _write(opened, experiment, shown, seconds, solution, files) | (compared or {})
         return conclude(opened, summary, files, done=compared is not None and not pressed, checkpoint=log.checkpoint)
