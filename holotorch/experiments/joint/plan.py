@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from holotorch.experiments.joint.budget import COARSE_PLANES, FEW_PLANES, PATIENCE, SLABS, stop
-from holotorch.experiments.joint.config import REFERENCE, JointSettings
+from holotorch.experiments.joint.config import BASELINES, REFERENCE, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.duration import duration
@@ -130,10 +130,13 @@ def _notes(experiment: JointExperiment) -> list[str]:
     if (error := experiment.budget.error(SLABS)) > FEW_PLANES:
         more, left = _more_planes(experiment)
         shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
+        # Where it is asked for by name, the comparison "slabs" needs a frame for each plane.
+        frames = f" frames={more}" if "slabs" in settings.report.baselines != BASELINES else ""
         still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
         notes.append(
             f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show {shown}; "
-            f"display.planes={more} would be {left:.0%} off, in about {more / len(foci):.2g} times the time{still}"
+            f"display.planes={more}{frames} would be {left:.0%} off, in about {more / len(foci):.2g} times the "
+            f"time{still}"
         )
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
     if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:
