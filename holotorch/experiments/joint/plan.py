@@ -64,6 +64,8 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     if display.kernel is not None:
         size = " x ".join(map(str, experiment.crosstalk.kernel.shape))
         spread = f"heat spreads by the measured kernel {display.kernel}, {size} px"
+    usual = display.rad_per_K == type(display).model_fields["rad_per_K"].default
+    thesis = ", that of the thesis's chip" if usual else ""
     memory = "" if heat is None else f"; {_left(settings):.1%} of the heat is left after a frame"
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {experiment.scene.width * 1e3:.3g} mm "
@@ -72,7 +74,8 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "
-        f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient{memory}",
+        f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient "
+        f"(display.rad_per_K={display.rad_per_K:.4g} at {REFERENCE * 1e9:.0f} nm{thesis}){memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the pupil",
         f"Solver     {_steps(values, experiment)}; compared with {_compared(settings)}",
