@@ -35,8 +35,8 @@ class EndCheck:
 class TipCheck:
     """Parameters of the search for the tube beyond the tip of a pose.
 
-    In five synthetic videos through codecs, at most 0.3 of the stations there showed a tube, and with the edges counted
-    from 5 mm behind the tip, at least 0.6.
+    In six synthetic recordings, four of them through codecs, none of 321 poses had a tube at ``EndCheck.shown`` of the
+    stations there; with the edges counted from 5 mm behind the tip, all 57 had.
     """
 
     clear: float = 1e-3  # metres: distance from the tip, besides ``deviations``
