@@ -97,9 +97,8 @@ def _steps(values: dict[str, Any], experiment: JointExperiment) -> str:
 
 
 def _compared(settings: JointSettings) -> str:
-    few = (
-        " (slabs, one plane a frame, needs as many frames)" if settings.comparisons != settings.report.baselines else ""
-    )
+    left_out = settings.comparisons != settings.report.baselines
+    few = " (slabs, one plane a frame, needs as many frames)" if left_out else ""
     return (", ".join(settings.comparisons) or "nothing") + few
 
 
@@ -134,7 +133,8 @@ def _notes(experiment: JointExperiment) -> list[str]:
         more, left = _more_planes(experiment)
         shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
         # Where it is asked for by name, the comparison "slabs" needs a frame for each plane.
-        frames = f" frames={more}" if "slabs" in settings.report.baselines != BASELINES else ""
+        names = settings.report.baselines
+        frames = f" frames={more}" if "slabs" in names and names != BASELINES else ""
         still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
         notes.append(
             f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show {shown}; "
