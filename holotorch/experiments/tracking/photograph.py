@@ -140,7 +140,7 @@ def _beside(
 ) -> list[str]:
     """Bands whose colour does not end across the tube: their place lies beside it.
 
-    The tube runs through all places. From each, the colour must end on both sides within a part of the distance to the
+    The tube runs through all of them. From each, the colour must end on both sides within a part of the distance to the
     next band, which is longer than the tube is wide.
     """
     centres = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2) for x0, y0, x1, y1 in boxes], dtype=torch.float64)

@@ -59,7 +59,7 @@ class PartCheck:
     angle: float = 15.0  # degrees between colours in linear light, beyond those of the bands that show both edges
 
 
-_PART = PartCheck()
+_TIP, _PART = TipCheck(), PartCheck()
 _INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # samples on the tube: distance from the axis in widths
 _BESIDE = np.array([0.9, 1.2, 1.5, 1.8])  # samples on either side of the tube: the same distance
 _ACROSS = np.concatenate([-_BESIDE[::-1], _INSIDE, _BESIDE])
@@ -94,31 +94,30 @@ def shows_reversed(
     return due is not None and due <= check.missing
 
 
-def shows_beyond_tip(frame: Tensor, lens: Lens, pose: Pose, catheter: Catheter, check: TipCheck | None = None) -> bool:
+def shows_beyond_tip(frame: Tensor, lens: Lens, pose: Pose, catheter: Catheter) -> bool:
     """Whether the tube goes on beyond the tip of a pose, which is then wrong, or another object lies there.
 
     Edges that are counted from a point behind the tip, or lengths of bands in the reversed order, fit as well as the
     right ones: only the tube's end contradicts them. False, too, where the frame, uint8 [3, H, W], ends.
     """
-    check = check or TipCheck()
     line, along = on_host(pose), pose.direction
     if line is None:
         return False
-    begin = check.clear + check.deviations * float((along @ pose.covariance[:3, :3] @ along).clamp(min=0).sqrt())
+    begin = _TIP.clear + _TIP.deviations * float((along @ pose.covariance[:3, :3] @ along).clamp(min=0).sqrt())
     stations = EndCheck(margin=0.0)
-    part = -begin - check.length, -begin
+    part = -begin - _TIP.length, -begin
     share = _share(Sampler(frame, lens.light), lens, line, catheter.radius, part, stations)
     return share is not None and share >= stations.shown
 
 
 def shows_other_colour(
-    sampler: Sampler, lens: Lens, axis: Axis, edges: Edges, expected: np.ndarray, catheter: Catheter, check=_PART
+    sampler: Sampler, lens: Lens, axis: Axis, edges: Edges, expected: np.ndarray, catheter: Catheter
 ) -> bool:
     """Whether a band that shows one of its edges has another colour than the catheter's.
 
-    Three edges are in their places, too, on bands in another order of which one is outside or has the colour of the
-    background: then the bare tube beside them passes for the missing band. ``expected`` [N] are the positions at which
-    the pose puts all edges.
+    Bands in another order, of which one is outside or has the colour of the background, may show three edges at the
+    right distances: then the bare tube beside them passes for the missing band. ``expected`` [N] are the positions in
+    pixels along ``axis`` at which the pose puts all edges.
     """
     colours = lens.light[np.array(catheter.colours)]
     visible = np.isfinite(edges.t)
@@ -127,17 +126,17 @@ def shows_other_colour(
         both = bool(visible[band] and visible[band + 1])
         for near, other in ((band, band + 1), (band + 1, band)):
             length = expected[other] - expected[near]
-            begin = max(check.part[0], check.blurs * edges.blur / abs(length))
-            if not visible[near] or begin > check.part[1]:
+            begin = max(_PART.part[0], _PART.blurs * edges.blur / abs(length))
+            if not visible[near] or begin > _PART.part[1]:
                 continue
-            t = expected[near] + length * np.linspace(begin, check.part[1], check.samples)
+            t = expected[near] + length * np.linspace(begin, _PART.part[1], _PART.samples)
             pixels = axis.line.pixels(lens, t, axis.width / 2 * _INSIDE)
-            if (seen := sampler.inside(pixels).all(-1)).sum() < check.fewest:
+            if (inside := sampler.inside(pixels).all(-1)).sum() < _PART.fewest:
                 continue
-            light = np.median(sampler(pixels[seen]).reshape(3, -1), 1)
+            light = np.median(sampler(pixels[inside]).reshape(3, -1), 1)
             cosine = light @ colour / max(float(np.linalg.norm(light) * np.linalg.norm(colour)), 1e-9)
             (whole if both else parts).append(math.degrees(math.acos(min(1.0, cosine))))
-    return max(parts) > max(whole) + check.angle
+    return max(parts) > max(whole) + _PART.angle
 
 
 def _share(

@@ -46,7 +46,7 @@ def test_look_alikes_are_refused(kind):
 
 @pytest.mark.parametrize("seed", [376, 644, 987])
 def test_bands_in_another_order_of_which_one_is_not_seen_are_refused(seed):
-    """Three edges in their places: one more is outside, and bare tube is where the missing band should be."""
+    """Three edges at the right distances: one more is outside, and bare tube is where the missing band should be."""
     world = VariedWorld()
     trial = world.negative(seed, "wrong order")
     pose = CatheterTracker(trial.camera, world.catheter, channels=ChannelOrder.RGB)(trial.frame()[None])[0]
