@@ -65,6 +65,7 @@ class EdgeLimits:
     same: float = 0.15  # the same ratio above which the bands continue beside the tube
     differs: float = 0.1  # least difference of the tube from both sides, as a fraction of the brighter light
     mostly: float = 0.8  # least fraction of the samples along an edge's window that differ where the tube is visible
+    moving: float = 3.0  # ratio of the blurs across and along the tube from which on it must have moved across
     clear: float = 4.0  # least change of the background in standard deviations for the change to be significant
 
 
@@ -259,7 +260,7 @@ def measure_edges(
     near = near - bulge * front.shift(shading.steps, shading.told, row)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6))).reshape(*every.shape[:2], 6, 3)
     texture = np.zeros(len(guess))
-    covered, texture[chosen] = _covered(beside, along - fit.place[:, None], fit, blur)
+    covered, texture[chosen] = _covered(beside, along - fit.place[:, None], fit, blur, axis.blur)
     within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
     clear = (fit.deviation < _LIMITS.vague) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
     hidden, outside, absent = list[int](), list[int](), list[int]()
@@ -439,10 +440,16 @@ def _leaking(widths: np.ndarray) -> np.ndarray:
     return np.array([-1.0, 1.0]) * (widths[:, None, None] / 2 + _WINDOW.leak)
 
 
-def _covered(light: np.ndarray, along: np.ndarray, fit: EdgeFit, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """First and last result of :func:`_across`; a Refusal if all edges continue beside the tube, sharp as ``blur``."""
+def _covered(
+    light: np.ndarray, along: np.ndarray, fit: EdgeFit, blur: float, across: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """First and last result of :func:`_across`; a Refusal if all edges continue beside the tube.
+
+    They do so, too, where a focused tube moved across: its sides are less sharp (``across``) than its edges, which have
+    the expected ``blur``. Then the check of the width decides.
+    """
     covered, beyond, texture = _across(light, along, fit)
-    if beyond and len(light) > 2 and median(fit.blur) < blur + BLURRED:
+    if beyond and len(light) > 2 and median(fit.blur) < blur + BLURRED and across < _LIMITS.moving * blur:
         text = "all bands continue beside the tube: the object is thicker than the catheter"
         raise Refusal(Status.INCONSISTENT, text, final=True)
     return covered, texture

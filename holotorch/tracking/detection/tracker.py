@@ -596,7 +596,6 @@ class CatheterTracker(nn.Module):
         floor = math.hypot(
             _FLOORS.model,
             _FLOORS.coarse_edge * edges.coarse,
-            _FLOORS.bulge * edges.bulge,
             _FLOORS.defocus * min(soft, smeared),
             _FLOORS.smear * smeared,
         )
@@ -613,8 +612,9 @@ class CatheterTracker(nn.Module):
         offset = math.hypot(shift, turn * (middle - axis.centre), _FLOORS.line)
         most = max(offset, turn * spread)
         positions = [self._positions[n] for n in known]
+        shared = math.hypot(_FLOORS.shared, _FLOORS.bulge * edges.bulge)
         line_pose = pose_on_line(
-            axis.line, t, positions, along, most, most / max(spread, 1e-9), _FLOORS.shared, rough=rough
+            axis.line, t, positions, along, most, most / max(spread, 1e-9), shared, rough=rough
         )
         if line_pose is None:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
