@@ -54,10 +54,9 @@ class ErrorFloors:
     """
 
     model: float = 0.004  # every edge: the edge profile and the sampling by pixels are approximate
-    transparency: float = 0.010  # outermost edges: the background is visible through the clear tube beside them
-    texture: float = 0.5  # outermost edges: per variation of the background relative to the edge's step of light
-    bulge: float = 0.004  # per pixel by which the front of a ring bulges along the line
-    shared: float = 0.010  # common to all edges of a frame
+    texture: float = 0.5  # outermost edges: per variation of the background, seen through the clear tube beside them
+    bulge: float = 0.004  # common to all edges of a frame: per pixel by which a ring's front bulges along the line
+    shared: float = 0.010  # common to all edges, too
     defocus: float = 0.08  # per pixel of blur in all directions, which lets light from beside the tube leak in
     smear: float = 0.03  # per pixel of blur along the tube, from the lens or from motion
     coarse_edge: float = 0.07  # edges of frames whose chroma has fewer pixels than their luma (4:2:0 codecs)
@@ -599,10 +598,8 @@ class CatheterTracker(nn.Module):
             _FLOORS.defocus * min(soft, smeared),
             _FLOORS.smear * smeared,
         )
-        through = [n in (0, last) for n in known]
         along = [
-            math.hypot(deviation, floor, outer * _FLOORS.transparency, outer * _FLOORS.texture * texture)
-            for deviation, texture, outer in zip(edges.deviation[known], edges.texture[known], through, strict=True)
+            math.hypot(edges.deviation[n], floor, (n in (0, last)) * _FLOORS.texture * edges.texture[n]) for n in known
         ]
         # Shading that is constant along the tube shifts and rotates the line by more than the deviations of its fit.
         # Both deviations, expressed as displacements at the edges, are therefore raised to the larger one.
@@ -613,9 +610,7 @@ class CatheterTracker(nn.Module):
         most = max(offset, turn * spread)
         positions = [self._positions[n] for n in known]
         shared = math.hypot(_FLOORS.shared, _FLOORS.bulge * edges.bulge)
-        line_pose = pose_on_line(
-            axis.line, t, positions, along, most, most / max(spread, 1e-9), shared, rough=rough
-        )
+        line_pose = pose_on_line(axis.line, t, positions, along, most, most / max(spread, 1e-9), shared, rough=rough)
         if line_pose is None:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return line_pose
