@@ -20,6 +20,12 @@ _ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}  # relative roundin
 _WAVE = 150.0  # for one sample of a spherical wave in float64
 _PASS = 12.0  # for one sample when an array is read and written once
 
+EDGE_MATTERS = (
+    "pixels bend light up to a largest angle only: the light of each point is a cone, which at this distance may fill "
+    "only part of the hologram; how its edge is defined (hologram.cone) then changes the field by more than the "
+    "tolerance, by up to tens of percent: state it where fields of other software are compared"
+)
+
 
 @dataclass(frozen=True)
 class HologramPlan:
@@ -214,11 +220,7 @@ def _notes(grid: Grid, wavelength: float, nearest: float, near: bool) -> tuple[s
     if across < 4:  # a narrower cone has too few samples to represent a spherical wave
         notes.append(f"a point on the nearest plane lights {across:.2g} pixels, too few to sample its spherical wave")
     if near:
-        notes.append(
-            "pixels bend light up to a largest angle only: the light of each point is a cone, which at this distance "
-            "may fill only part of the hologram; how its edge is defined (hologram.cone) then changes the field by "
-            "more than the tolerance, by up to tens of percent: state it where fields of other software are compared"
-        )
+        notes.append(EDGE_MATTERS)
     if min(grid.pitch) <= wavelength / 2:
         notes.append("the pitch is at or below half a wavelength: light leaves in every direction")
     return tuple(notes)

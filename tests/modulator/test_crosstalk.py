@@ -175,3 +175,13 @@ def test_forward_mode_in_sigma_and_phase_is_the_central_difference():
 def test_the_name_of_a_file_in_place_of_a_patch_says_how_to_read_it():
     with pytest.raises(TypeError, match=r"got the name of a file; of a table in CSV give torch.from_numpy"):
         ThermalCrosstalk.from_patch("kernel.csv")  # type: ignore[arg-type]
+
+
+def test_the_unit_of_a_learnable_table_does_not_matter():
+    """The same step of a learner moves the kernel as far, whatever unit the rises have."""
+    table = torch.tensor([[0.1, 0.2, 0.1], [0.2, 1.0, 0.2], [0.1, 0.2, 0.1]], dtype=torch.float64)
+    one, other = (ThermalCrosstalk.from_patch(scale * table, learnable=True) for scale in (1.0, 40.0))
+    assert one.patch is not None and isinstance(other.patch, torch.nn.Parameter)
+    assert torch.allclose(one.patch, other.patch)
+    kept = torch.nn.Parameter(40 * table)
+    assert ThermalCrosstalk.from_patch(kept).patch is kept

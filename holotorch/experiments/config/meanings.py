@@ -19,6 +19,7 @@ MEANINGS = {
     "PeripheralWeightSettings.e2_deg": "eccentricity at which the weight is a quarter",
     "ModulatorSettings.kernel": "a measured heat kernel in place of sigma_px: NumPy or CSV file of temperature rises",
     "ModulatorSettings.max_temperature": "limit on pixels above ambient, such as 500 degC, in place of max_phase",
+    "rad_per_K_at": "wavelength of rad_per_K",
     "NearFieldSettings.distance": "from the array to the image; several for an image at each",
     "NearFieldSettings.boundary": "a single array, or its periodic repetition as in the dissertation",
     "PECSettings.frames": "heater patterns shown in turn, whose intensities add in the eye",

@@ -79,6 +79,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
             f"deg; a scene {values['filling_scene_mm']:.4g} mm wide would fill it"
         )
     near, far = (f"{z:.4g}" if z else "beyond infinity" for z in values["accommodation_mm"])
+    dioptres = " to ".join(f"{1e3 / z:.2g}" for z in values["accommodation_mm"] if z)
     regions = sorted({*values["region_of_centre"], *values["region_of_edge"]})
     meanings = "; ".join(f"{_ROMAN[number]}: {_REGIONS[number]}" for number in regions)
     meanings += "; this cone is as wide as the pixels can bend light"
@@ -87,7 +88,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
     lines = [
         f"Field      {fields}",
         f"Eye box    {_span(values['eye_box_mm'])} mm wide; {entering} % of the light from the scene's edge enters the "
-        f"pupil; the scene appears {near} to {far} mm from the eye",
+        f"pupil; the scene appears {near} to {far} mm from the eye" + (f" ({dioptres} dioptres)" if dioptres else ""),
         f"Regions    centre {_list(values['region_of_centre'])}, edge {_list(values['region_of_edge'])} ({meanings}); "
         f"the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near "
         f"end, {spots[1]} um at the far end",

@@ -22,7 +22,7 @@ from holotorch.experiments.config.settings import (
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.volume.config import Depth, TransferSettings, ViewSettings, VolumeSource
 
-REFERENCE = 630e-9  # metres, wavelength of ``display.rad_per_K``
+MOST_PLANES = 256
 PLANES = 5  # number of planes of a run without tolerance, if it is not stated
 FOCI_PER_STEP = 2  # foci of the whole pupil that each step takes, if it takes some of the views
 Baseline = Literal["random", "afterwards", "unheated", "light_field", "retrieved", "retrieved_pec", "slabs"]
@@ -39,17 +39,23 @@ class DisplaySettings(GridSettings):
     ``sigma_px`` says, a measured one, a NumPy or CSV file as in runs of kind pec. ``max_phase``: upper limit in rad on
     the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm). ``max_temperature``: in its place a
     limit on the temperature of every pixel above ambient, such as 500 degC, which gives
-    one limit in phase for all colours. ``rad_per_K``: phase per kelvin at 630 nm, as of a chip in runs of kind pec.
+    one limit in phase for all colours. ``rad_per_K``, ``rad_per_K_at``: as of a chip in runs of kind pec.
     """
 
     distance: Depth
     depth: Depth | None = None
-    planes: Annotated[Count, Field(le=64)] | None = None
+    planes: Annotated[Count, Field(le=MOST_PLANES)] | None = None
     sigma_px: Annotated[Number, plausible(SIGMA_PX)] = 0.66
     kernel: ExistingPath | None = None
     max_phase: Phase = 4 * math.pi
     max_temperature: TemperatureRise | None = None
     rad_per_K: Annotated[Number, Field(ge=1e-5, le=10)] = math.pi / 175
+    rad_per_K_at: Wavelength = 630e-9
+
+    @property
+    def reference_response(self) -> float:
+        """Phase in rad per kelvin at the reference wavelength of ``PhasedArray``, 630 nm."""
+        return self.rad_per_K * self.rad_per_K_at / 630e-9
 
 
 class EyeSettings(Settings):
@@ -135,7 +141,7 @@ class JointSettings(Settings):
         display = self.display
         if display.max_temperature is None:
             return display.max_phase
-        return display.max_temperature * display.rad_per_K * REFERENCE / max(self.wavelengths)
+        return display.max_temperature * display.rad_per_K * display.rad_per_K_at / max(self.wavelengths)
 
     @property
     def comparisons(self) -> tuple[Baseline, ...]:

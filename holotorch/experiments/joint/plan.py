@@ -6,10 +6,11 @@ from typing import Any
 import torch
 
 from holotorch.experiments.joint.budget import COARSE_PLANES, FEW_PLANES, PATIENCE, SLABS, stop
-from holotorch.experiments.joint.config import BASELINES, REFERENCE, JointSettings
+from holotorch.experiments.joint.config import BASELINES, MOST_PLANES, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.duration import duration
+from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.volume.plan import cut_off, dark_picture, preset_note, viewpoint
 from holotorch.optics.light.coherence import depth_of_focus
@@ -64,6 +65,8 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     if display.kernel is not None:
         size = " x ".join(map(str, experiment.crosstalk.kernel.shape))
         spread = f"heat spreads by the measured kernel {display.kernel}, {size} px"
+        if (noise := outer_noise(experiment.crosstalk.kernel)) > NOISY:
+            spread += f", whose taps differ as by noise of {noise:.1g} of the centre"
     usual = display.rad_per_K == type(display).model_fields["rad_per_K"].default
     thesis = ", that of the thesis's chip" if usual else ""
     memory = "" if heat is None else f"; {_left(settings):.1%} of the heat is left after a frame"
@@ -75,7 +78,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient "
-        f"(display.rad_per_K={display.rad_per_K:.4g} at {REFERENCE * 1e9:.0f} nm{thesis}){memory}",
+        f"(display.rad_per_K={display.rad_per_K:.4g} at {display.rad_per_K_at * 1e9:.4g} nm{thesis}){memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the pupil",
         f"Solver     {_steps(values, experiment)}; compared with {_compared(settings)}",
@@ -104,7 +107,8 @@ def _compared(settings: JointSettings) -> str:
 
 def _temperatures(settings: JointSettings) -> str:
     """Temperature of the hottest pixel that the limit allows, for each wavelength."""
-    response = [settings.display.rad_per_K * REFERENCE / wavelength for wavelength in settings.wavelengths]
+    display = settings.display
+    response = [display.rad_per_K * display.rad_per_K_at / wavelength for wavelength in settings.wavelengths]
     return " / ".join(f"{settings.limit / each:.0f}" for each in response)
 
 
@@ -114,14 +118,36 @@ def _left(settings: JointSettings) -> float:
 
 
 def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
-    """The least of 2, 4 and 8 times as many planes that are close enough to the volume, else 8 times, and its error."""
+    """The least of 2, 4 and 8 times as many planes that are close enough to the volume, else 8 times, and its error.
+
+    Never more than ``MOST_PLANES``.
+    """
     count, error = len(experiment.foci), math.inf
     for factor in (2, 4, 8):
-        if error > FEW_PLANES:
-            count = factor * len(experiment.foci)
+        if error > FEW_PLANES and count < MOST_PLANES:
+            count = min(MOST_PLANES, factor * len(experiment.foci))
             more = with_planes(experiment.scene, experiment.settings, count)
             error = more.sampler().slab_error(more.volume)
     return count, error
+
+
+def _few_planes(experiment: JointExperiment, error: float) -> str:
+    """A note on planes that are ``error`` off the volume, and on what is closer."""
+    settings, count = experiment.settings, len(experiment.foci)
+    shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
+    words = f"{count} planes are {error:.0%} off this volume: the array forms their pictures, which show {shown}; "
+    if count >= MOST_PLANES:
+        return words + "more of them are not accepted: thicker or softer parts (transfer), or a part of the volume"
+    more, left = _more_planes(experiment)
+    # Where it is asked for by name, the comparison "slabs" needs a frame for each plane.
+    names = settings.report.baselines
+    frames = f" frames={more}" if "slabs" in names and names != BASELINES else ""
+    still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
+    fewer = "" if settings.eye.per_step else " and memory"
+    return (
+        f"{words}display.planes={more}{frames} would be {left:.0%} off, in about {more / count:.2g} times the "
+        f"time{fewer}{still}"
+    )
 
 
 def _notes(experiment: JointExperiment) -> list[str]:
@@ -130,17 +156,9 @@ def _notes(experiment: JointExperiment) -> list[str]:
     if words := preset_note(experiment.scene):
         notes.append(words)
     if (error := experiment.budget.error(SLABS)) > FEW_PLANES:
-        more, left = _more_planes(experiment)
-        shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
-        # Where it is asked for by name, the comparison "slabs" needs a frame for each plane.
-        names = settings.report.baselines
-        frames = f" frames={more}" if "slabs" in names and names != BASELINES else ""
-        still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
-        notes.append(
-            f"{len(foci)} planes are {error:.0%} off this volume: the array forms their pictures, which show {shown}; "
-            f"display.planes={more}{frames} would be {left:.0%} off, in about {more / len(foci):.2g} times the "
-            f"time{still}"
-        )
+        notes.append(_few_planes(experiment, error))
+    if settings.display.kernel is not None:
+        notes += cut_off_note(experiment.crosstalk.kernel)
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
     if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:
         notes.append(

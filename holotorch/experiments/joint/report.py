@@ -30,15 +30,17 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
     others = {name: each["stack_psnr"] for name, each in methods.items() if name != "joint"}
     if others:
         best = max(others, key=others.__getitem__)
-        scores.append(f"the best other method, {NAMES[best]}: {others[best]:.1f} dB at the corrected foci")
-    error, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), []
+        ideal = " (no chip shows such fields)" if best == "random" else ""
+        scores.append(f"the best other method, {NAMES[best]}{ideal}: {others[best]:.1f} dB at the corrected foci")
+    error, of, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), "", []
     if error > FEW_PLANES:
         shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
         notes.append(
-            f"Warning    the planes are {error:.0%} off the volume: they show {shown}, and the PSNR is that of "
-            "their pictures; more of them (display.planes) come closer"
+            f"Warning    the planes are {error:.0%} off the volume: they show {shown}; more of them (display.planes) "
+            "come closer"
         )
-    return [*notes, f"Result     PSNR {'; '.join(scores)}", *error_line(summary)]
+        of = f", of pictures that are {error:.0%} off the volume"
+    return [*notes, f"Result     PSNR {'; '.join(scores)}{of}", *error_line(summary)]
 
 
 def joint_section(record: RunRecord) -> list[str]:

@@ -82,6 +82,8 @@ def _fingerprint(experiment: JointExperiment) -> Fingerprint:
         free.remove("steps")  # the learning rate falls over the steps
     if settings.eye.parallax:
         inputs["eye.parallax"] = (repr(experiment.trained.operator.views),)
+    if settings.display.rad_per_K_at == type(settings.display).model_fields["rad_per_K_at"].default:
+        free.add("display.rad_per_K_at")  # checkpoints of before there was one do not have it
     if settings.display.kernel is None:
         free.add("display.kernel")  # checkpoints of before there was one do not have it
     else:

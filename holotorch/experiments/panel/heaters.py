@@ -127,9 +127,10 @@ def heaters_text(report: dict[str, Any]) -> str:
     return (
         f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s): heater_*: phases in rad that each "
         f"heater alone causes at its own pixel, before the heat spreads (a step of the PNG is {step:.4g} rad, "
-        f"{report['heater_bits']} bits); temperature_*: K above ambient, at most {report['peak_temperature_K']:.0f}; "
-        "optical_*: phases of the light in rad after spreading, not modulo 2 pi. What fewer bits cost, holotorch view "
-        "of the run shows (Levels of the heaters), and modulator.bits computes a run for them. A liquid-crystal panel "
+        f"{report['heater_bits']} bits, so that few bits look black in a viewer); temperature_*: K above ambient, at "
+        f"most {report['peak_temperature_K']:.0f}; optical_*: phases of the light in rad after spreading, not modulo "
+        "2 pi. What fewer bits cost, holotorch view of the run shows (Levels of the heaters), and modulator.bits "
+        "computes a run for them. A liquid-crystal panel "
         "needs holotorch export-slm instead" + warning
     )
 
@@ -156,7 +157,7 @@ def _load(folder: Path) -> _Chip:
             return _Chip(phase, experiment.array, experiment.array.crosstalk, experiment.limit)
         if isinstance(settings, JointSettings):
             joint = build_joint(settings)
-            response = settings.display.rad_per_K
+            response = settings.display.reference_response
             array = PhasedArray(settings.wavelengths, joint.crosstalk.cpu(), reference_response=response)
             return _Chip(joint_heaters(folder, settings).double(), array, joint.heat.cpu(), settings.limit)
     except ConfigError:

@@ -78,7 +78,7 @@ def _heaters(settings: PECSettings, start: str) -> HeaterPhases:
     if chip.max_phase is not None:
         limit = chip.max_phase
     elif chip.max_temperature is not None:
-        limit = chip.max_temperature * chip.rad_per_K * REFERENCE_WAVELENGTH / max(settings.wavelengths)
+        limit = chip.max_temperature * chip.reference_response * REFERENCE_WAVELENGTH / max(settings.wavelengths)
     # Corrected phases have means of 3.3 to 4.1 rad and deviations of 2.1 to 2.8 from a hot start, others less.
     mean, deviation = (4.0, 2.5) if start == "hot" else (1.0, 1.2)
     if start == "quadratic":

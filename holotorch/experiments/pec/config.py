@@ -87,9 +87,9 @@ class ModulatorSettings(Settings):
     of every pixel after the heat has spread, such as 4pi (700 degC at 630 nm); no limit by default, as in the thesis.
     ``max_temperature``: in its place a limit on the temperature of every pixel above ambient, such as 500 degC. All
     colours have one limit in phase, so that only the one with the smallest phase per kelvin gets as warm.
-    ``rad_per_K``: phase per kelvin at 630 nm, by default that of the thesis, pi / 175 K; other wavelengths in inverse
-    proportion. ``bits``: resolution of the heaters, whose levels
-    are evenly spaced from 0 to the largest phase. ``power_weight``: weight of the sum of the heater phases in the loss.
+    ``rad_per_K``: phase per kelvin at the wavelength ``rad_per_K_at``, by default that of the thesis, pi / 175 K; other
+    wavelengths in inverse proportion. ``bits``: resolution of the heaters, whose levels are evenly spaced from 0 to the
+    largest phase. ``power_weight``: weight of the sum of the heater phases in the loss.
     """
 
     sigma_px: Annotated[Annotated[Number, plausible(SIGMA_PX)] | None, Field(description=SIGMA_MEANING)] = None
@@ -98,8 +98,14 @@ class ModulatorSettings(Settings):
     max_phase: Phase | None = None
     max_temperature: TemperatureRise | None = None
     rad_per_K: Annotated[Number, Field(ge=1e-5, le=10)] = math.pi / 175
+    rad_per_K_at: Wavelength = 630e-9
     bits: Annotated[Count, Field(le=16)] | None = None
     power_weight: Annotated[Number, Field(ge=0, le=1e6)] = 0.0
+
+    @property
+    def reference_response(self) -> float:
+        """Phase in rad per kelvin at the reference wavelength of ``PhasedArray``, 630 nm."""
+        return self.rad_per_K * self.rad_per_K_at / 630e-9
 
 
 class FraunhoferSettings(Settings):

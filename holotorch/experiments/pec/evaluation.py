@@ -11,6 +11,7 @@ from holotorch.core.complex import intensity
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.weight import zone_scores
+from holotorch.experiments.planning.heat_kernel import continued, is_cut_off
 from holotorch.metrics import SSIM_WINDOW, dark_spots, psnr, ssim
 from holotorch.modulator import PhasedArray, ThermalCrosstalk
 from holotorch.optics import CroppedKernel
@@ -99,13 +100,30 @@ def with_noisy_kernels(experiment: PECExperiment, phase: Tensor, noise: float) -
         kernel = assumed + noise * torch.randn(assumed.shape, generator=generator, dtype=assumed.dtype)
         kernel = kernel.clamp(0, 1)
         kernel[kernel.shape[0] // 2, kernel.shape[1] // 2] = 1
-        chip = PhasedArray(experiment.wavelengths, ThermalCrosstalk.from_patch(kernel)).to(experiment.device)
-        formed = experiment.mean_intensity(lambda frame, chip=chip: chip(frame.double()), phase.detach())
-        formed = experiment.picture_in(formed).cpu()
-        picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
-        scores.append(_scores(experiment, picture, experiment.image))
-    means = [f"{name}_mean" for name in experiment.settings.report.metrics]
-    return {"noise": noise} | {name: [score[name] for score in scores] for name in means}
+        scores.append(_with_kernel(experiment, phase, kernel))
+    return {"noise": noise} | {name: [score[name] for score in scores] for name in scores[0]}
+
+
+def with_continued_kernel(experiment: PECExperiment, phase: Tensor) -> dict[str, Any] | None:
+    """Scores of heater phases [F, C, H, W] where the heat beyond the table of a measured kernel spreads, too.
+
+    None for a Gaussian kernel, for a measured one whose table holds nearly all of the heat, and for one that does not
+    tell how the heat falls beyond it (see :func:`continued`).
+    """
+    kernel = experiment.array.crosstalk.kernel
+    if experiment.settings.modulator.kernel is None or not is_cut_off(kernel):
+        return None
+    whole = continued(kernel, experiment.grid.shape)
+    return None if whole is None else _with_kernel(experiment, phase, whole) | {"taps": list(whole.shape)}
+
+
+def _with_kernel(experiment: PECExperiment, phase: Tensor, kernel: Tensor) -> dict[str, float]:
+    """Means of the scores over the lit colours where heat spreads by ``kernel`` [h, w] with 1 at its centre."""
+    chip = PhasedArray(experiment.wavelengths, ThermalCrosstalk.from_patch(kernel)).to(experiment.device)
+    formed = experiment.mean_intensity(lambda frame: chip(frame.double()), phase.detach())
+    picture = _as_picture(experiment, experiment.picture_in(formed).cpu(), at_best_scale=experiment.scale_free)
+    scores = _scores(experiment, picture, experiment.image)
+    return {name: scores[name] for metric in experiment.settings.report.metrics if (name := f"{metric}_mean")}
 
 
 def _heating(experiment: PECExperiment, phase: Tensor) -> dict[str, Any]:

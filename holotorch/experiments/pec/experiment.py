@@ -319,7 +319,9 @@ def build(settings: PECSettings) -> PECExperiment:
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
     isolated = getattr(settings.propagator, "boundary", None) == "isolated"
     start = settings.solver.start or ("flat" if isolated else "hot")
-    array = PhasedArray(wavelengths, _crosstalk(settings, start), reference_response=settings.modulator.rad_per_K)
+    array = PhasedArray(
+        wavelengths, _crosstalk(settings, start), reference_response=settings.modulator.reference_response
+    )
     return PECExperiment(settings, source, lit, array, start, find_device(settings.device))
 
 

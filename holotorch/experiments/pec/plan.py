@@ -5,7 +5,6 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from holotorch.correction.problem import FRAMES_AT_ONCE
 from holotorch.experiments.pec.budget import stop
@@ -14,6 +13,7 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import evaluations, padded_samples, seconds_of
 from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.duration import duration
+from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
@@ -158,7 +158,7 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
     """The measured kernel, and the Gaussian that fits it best."""
     kernel = experiment.array.crosstalk.kernel
     values = {"kernel": experiment.settings.modulator.kernel, "taps": list(kernel.shape), "total": kernel.sum().item()}
-    values["noise"] = _outer_noise(kernel)
+    values["noise"] = outer_noise(kernel)
     try:
         fitted = ThermalCrosstalk.fitted(kernel)
     except ValueError:  # a single pixel, or one that is as warm as its surroundings
@@ -169,20 +169,11 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
     return values | {"fitted_sigma_px": fitted.sigma_px, "fit_residual": residual}
 
 
-def _outer_noise(kernel: Tensor) -> float:
-    """Noise of the taps of a kernel [h, w], relative to its centre: of the outermost ring, where heat is least.
-
-    Heat spreads as far to one side as to the opposite one, so that opposite taps of the ring differ by noise alone.
-    """
-    ring = torch.ones_like(kernel, dtype=torch.bool)
-    ring[1:-1, 1:-1] = False
-    return (kernel - kernel.flip((0, 1)))[ring].square().mean().div(2).sqrt().item()
-
-
+# Limit in the far field, over the root of the kernel's sum, below which pictures are lost: for sigmas of 0.66 to 2 px,
+# SSIM of four joint frames at 64 px is 0.16 to 0.86 at 0.6 to 3.6, 0.79 to 1.0 at 4.05 to 4.5, and from 0.92 at 5.3.
+_FAR_FIELD = 4.0
 _SAME_ASPECT = 0.01  # relative change of an aspect ratio that nobody sees
-_WARM = 0.02  # mean rise along a side of a measured kernel, relative to its centre, above which heat is missing
 _LITTLE = 1.0  # rad: of random phases that differ by less, over 0.9 of the light goes straight on (sinc^2(1/2))
-_NOISY = 2e-4  # noise of a measured kernel above which it is stated; a thousandth costs little (correct_my_chip.md)
 _FEW_SPOTS = 0.1  # width of a spot, relative to the array, from which on hardly ten of them lie side by side
 _NO_GAUSSIAN = 0.05  # rest of a fit above which corrections for the Gaussian lose much of their gain
 
@@ -197,7 +188,7 @@ def _crosstalk_line(values: dict[str, Any]) -> str:
             )
             if values["fit_residual"] > _NO_GAUSSIAN:
                 line += ", more than noise: a sigma alone would not represent this kernel"
-        if (noise := values["noise"]) > _NOISY:
+        if (noise := values["noise"]) > NOISY:
             line += (
                 f"; opposite taps of its outermost ring differ as by noise of {noise:.1g} of the centre: "
                 f"report.kernel_noise={noise:.1g} tells what that costs"
@@ -237,7 +228,7 @@ def _heat(experiment: PECExperiment) -> str:
         if chip.rad_per_K == type(chip).model_fields["rad_per_K"].default
         else ""
     )
-    steps += f"; modulator.rad_per_K={chip.rad_per_K:.4g} at 630 nm{thesis}"
+    steps += f"; modulator.rad_per_K={chip.rad_per_K:.4g} at {chip.rad_per_K_at * 1e9:.4g} nm{thesis}"
     if limit is None:
         return "no limit, as in the thesis: the hottest pixel is reported" + steps
     kelvin = [limit / response for response in experiment.array.response]
@@ -253,16 +244,6 @@ def _padding_reason(experiment: PECExperiment) -> str:
     return "unpadded: the far field of the array, sampled once per pixel"
 
 
-def _warm_ring(experiment: PECExperiment) -> float:
-    """Largest mean rise along a side of a measured kernel, relative to its centre; 0 for a Gaussian one."""
-    if experiment.settings.modulator.kernel is None:
-        return 0.0
-    kernel = experiment.array.crosstalk.kernel
-    middle = kernel[kernel.shape[0] // 2, kernel.shape[1] // 2]
-    sides = [side.mean() for side in (kernel[0], kernel[-1], kernel[:, 0], kernel[:, -1]) if kernel.numel() > len(side)]
-    return float(max(sides, default=0.0 * middle) / middle)
-
-
 def _notes(experiment: PECExperiment) -> list[str]:
     """Warnings about the limits of the model."""
     notes = []
@@ -272,6 +253,15 @@ def _notes(experiment: PECExperiment) -> list[str]:
             f"the limit lets phases differ by {experiment.limit:.3g} rad at most, which steers little light: no solver "
             "and no number of frames makes a good picture of that"
         )
+    elif experiment.limit is not None and not distances:
+        least = _FAR_FIELD * math.sqrt(experiment.array.crosstalk.kernel.sum().item())
+        if experiment.limit < least:
+            warmest = max(least / response for response in experiment.array.response)
+            notes.append(
+                f"in the far field this kernel needs a limit of about {least:.3g} rad ({warmest:.0f} degC above "
+                "ambient): below it much of the picture is lost; a picture at a distance needs less "
+                "(propagator.kind=fresnel)"
+            )
     if distances:
         limit, farthest = unaliased_distance(grid, longest, 1), max(map(abs, distances))
         if min(distances) < 0:
@@ -307,11 +297,8 @@ def _notes(experiment: PECExperiment) -> list[str]:
     lost = experiment.array.crosstalk.lost_heat
     if lost > 0.01:
         notes.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
-    if (ring := _warm_ring(experiment)) > _WARM:
-        notes.append(
-            f"the measured kernel is cut off where the rise is still {ring:.1%} of that of its centre: the heat beyond "
-            "is not in the model; give more rows and columns, or subtract what is not heat"
-        )
+    if experiment.settings.modulator.kernel is not None:
+        notes += cut_off_note(experiment.array.crosstalk.kernel)
     if dark := [i for i, on in enumerate(experiment.lit.tolist()) if not on]:
         notes.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
     if experiment.source.mean() < 0.02:

@@ -20,6 +20,7 @@ METHOD_NAMES = {
 ISOLATED_NAME = "Corrected, on a chip that stands alone"
 BETWEEN_NAME = "Corrected, midway between the samples"
 _PICTURES = {"target": "Target", **METHOD_NAMES, "between": BETWEEN_NAME, "isolated": ISOLATED_NAME}
+_MELTING = 1390.0  # K above ambient at which silicon melts (1414 degC)
 _POOR = 0.8  # SSIM of a corrected picture below which more frames are advised
 _FIGURES = {
     "phase": "Heater phases, before the heat spreads{frame}",
@@ -44,12 +45,14 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
         scores.append(
             f"SSIM {_fixed(between, 3)} midway between the samples (between.png), which a viewer sees as well"
         )
-    scores.append(f"hottest pixel {max(corrected['peak_temperature_rise_K']):.0f} degC above ambient")
-    noise = [f"Kernel     {_with_noise(numbers)}"] if (numbers := corrected.get("kernel_noise")) else []
+    hottest = max(corrected["peak_temperature_rise_K"])
+    melts = ", where silicon has melted: modulator.max_temperature sets a limit" if hottest > _MELTING else ""
+    scores.append(f"hottest pixel {hottest:.0f} degC above ambient{melts}")
+    kernel = [f"Kernel     {words}" for words in _other_kernels(corrected)]
     advice = []
     if corrected.get("frames") == 1 and corrected.get("ssim_mean", 1.0) < _POOR:
         advice.append("Note       several frames in turn, whose mean is seen, come closer to the picture: frames=4")
-    return [f"Result     {', '.join(scores)}", *noise, *advice, *error_line(summary)]
+    return [f"Result     {', '.join(scores)}", *kernel, *advice, *error_line(summary)]
 
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:
@@ -64,8 +67,8 @@ def pec_section(run: RunRecord) -> list[str]:
     parts = [heading(run.title, run.summary["status"])]
     parts.append(_table([{"method": METHOD_NAMES.get(name, name)} | _cells(each) for name, each in methods.items()]))
     parts.append(element("p", _verdict(run)))
-    if numbers := methods["corrected"].get("kernel_noise"):
-        parts.append(element("p", f"Should the heat kernel be wrong, with {_with_noise(numbers)}."))
+    for words in _other_kernels(methods["corrected"]):
+        parts.append(element("p", f"Should the heat kernel be wrong: {words}."))
     if sentence := error_sentence(run.summary):
         parts.append(element("p", sentence))
     parts += [*_zone_table(methods), '<div class="row">']
@@ -125,12 +128,21 @@ def _verdict(run: RunRecord) -> str:
     )
 
 
-def _with_noise(numbers: dict[str, Any]) -> str:
-    """Worst scores with noise in the taps of the heat kernel, in words."""
-    names = {"ssim_mean": "SSIM {:.3f}", "psnr_mean": "PSNR {:.1f} dB"}
-    scores = [text.format(min(numbers[name])) for name, text in names.items() if name in numbers]
-    chips = f"at worst of {max(len(value) for value in numbers.values() if isinstance(value, list))} chips"
-    return f"noise of {100 * numbers['noise']:g} % of the centre in every tap: {', '.join(scores)} {chips}"
+def _other_kernels(corrected: dict[str, Any]) -> list[str]:
+    """Scores of the corrected picture where the heat kernel is not the assumed one, in words."""
+    names, lines = {"ssim_mean": "SSIM {:.3f}", "psnr_mean": "PSNR {:.1f} dB"}, []
+    if numbers := corrected.get("kernel_noise"):
+        scores = [text.format(min(numbers[name])) for name, text in names.items() if name in numbers]
+        chips = f"at worst of {max(len(value) for value in numbers.values() if isinstance(value, list))} chips"
+        lines.append(f"noise of {100 * numbers['noise']:g} % of the centre in every tap: {', '.join(scores)} {chips}")
+    if numbers := corrected.get("kernel_continued"):
+        scores = [text.format(numbers[name]) for name, text in names.items() if numbers.get(name) is not None]
+        size = " x ".join(map(str, numbers["taps"]))
+        lines.append(
+            f"the measured table is cut off; if the rise falls on beyond it as it does within (to {size} px): "
+            f"{', '.join(scores)}"
+        )
+    return lines
 
 
 def _zone_table(methods: dict[str, dict[str, Any]]) -> list[str]:

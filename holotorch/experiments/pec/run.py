@@ -8,9 +8,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from holotorch.correction import Solution
 from holotorch.experiments.pec.baselines import baseline
-from holotorch.experiments.pec.evaluation import Result, evaluate, speckle_spots, with_noisy_kernels
+from holotorch.experiments.pec.evaluation import (
+    Result,
+    evaluate,
+    speckle_spots,
+    with_continued_kernel,
+    with_noisy_kernels,
+)
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.measured import pec_errors
 from holotorch.experiments.pec.progress import Log
@@ -64,9 +72,8 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
             results["corrected"].numbers.update(attempts)
-            if (noise := settings.report.kernel_noise) is not None and not signals:
-                phase = results["corrected"].phase.to(experiment.device)
-                results["corrected"].numbers["kernel_noise"] = with_noisy_kernels(experiment, phase, noise)
+            if not signals:
+                results["corrected"].numbers.update(_with_other_kernels(experiment, results["corrected"].phase))
             files.write(save_array, out / "arrays" / "phase.npy", results["corrected"].phase.float())
         results |= _baselines(experiment, signals)
         errors = None if signals else measured_values(lambda: pec_errors(experiment, solution))
@@ -89,6 +96,9 @@ def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     free = {"device", "report.baselines", "report.kernel_noise", "solver.reruns"}  # computed after the solver
     if experiment.settings.tolerance is None:
         free.add("tolerance")  # checkpoints of before there was one do not have it
+    chip = experiment.settings.modulator
+    if chip.rad_per_K_at == type(chip).model_fields["rad_per_K_at"].default:
+        free.add("modulator.rad_per_K_at")  # the same
     if experiment.settings.solver.kind != "lbfgs":  # the stages of L-BFGS depend on max_steps
         free.add("solver.max_steps")
     inputs: dict[str, tuple[Any, ...]] = {"target.image": (experiment.source,)}
@@ -97,6 +107,16 @@ def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     kept = fingerprint(experiment.settings, inputs, free)
     # This entry refuses checkpoints of version 0.1.0, whose joint frames are [C, F, H, W], the same shape if F = C.
     return kept | ({"axes of joint frames": "F, C, H, W"} if experiment.joint else {})
+
+
+def _with_other_kernels(experiment: PECExperiment, phase: Tensor) -> dict[str, Any]:
+    """Scores of the phases of all colours [F, C, H, W] on chips whose heat kernel is not quite the assumed one."""
+    phase, numbers = phase[:, experiment.lit].to(experiment.device), dict[str, Any]()
+    if (noise := experiment.settings.report.kernel_noise) is not None:
+        numbers["kernel_noise"] = with_noisy_kernels(experiment, phase, noise)
+    if (scores := with_continued_kernel(experiment, phase)) is not None:
+        numbers["kernel_continued"] = scores
+    return numbers
 
 
 def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, single: bool = False) -> Result:
@@ -144,7 +164,7 @@ def _write_results(
     files.write(save_array, out / "arrays" / "intensity.npy", corrected.picture)
     files.write(save_array, out / "arrays" / "target.npy", experiment.image)
     shown = {"target": experiment.image} | {name: results[name].picture for name in METHOD_NAMES if name in results}
-    captions = ["Target", *(METHOD_NAMES[name] + _score(results[name].numbers) for name in shown if name in results)]
+    captions = ["Target", *(_caption(experiment, name, results[name].numbers) for name in shown if name in results)]
     shown["between"] = corrected.between
     captions.append(BETWEEN_NAME + _score(corrected.numbers["between_samples"]))
     if corrected.isolated is not None and not experiment.isolated:
@@ -172,6 +192,14 @@ def _write_results(
         drawn["weight"] = figures.visual_field(weight_map(weight, shape), angles, weight.field_deg, rings, "weight")
     for name, data in drawn.items():
         files.write(write_bytes, out / "images" / f"{name}.png", data)
+
+
+def _caption(experiment: PECExperiment, name: str, numbers: dict[str, Any]) -> str:
+    """Method and score of a picture, and in what it is not comparable with the corrected one."""
+    frames = ", 1 frame" if numbers["frames"] == 1 < experiment.settings.frames else ""
+    limit = experiment.limit
+    above = ", above the limit" if limit is not None and numbers["peak_phase_rad"] > (1 + 1e-3) * limit else ""
+    return METHOD_NAMES[name] + _score(numbers) + frames + above
 
 
 def _score(numbers: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.machine import Machine, machine_speed, seconds_in_words
 from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.experiments.volume.report import EDGES, METHODS
+from holotorch.hologram.plan import EDGE_MATTERS
 from holotorch.optics import diffraction_angle
 from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.scene import DVRSampler
@@ -189,15 +190,20 @@ def preset_note(experiment: VolumeExperiment) -> str:
     low, high = experiment.preset_range
     transfer = experiment.transfer
     hidden = float(transfer.positions[max(0, int((transfer.opacities > 0).to(torch.uint8).argmax()) - 1)])
+    preset, least = experiment.settings.transfer.preset, float(experiment.volume.values.min())
+    lower = [f"{(least + each) / 2:.3g}" for each in (low, high, hidden)]
     return (
-        f"the preset {experiment.settings.transfer.preset} lies between {low:.3g} and {high:.3g}, from the histogram, "
-        f"and shows nothing of values below {hidden:.3g}: look at it with holotorch check --preview; a lower "
-        "transfer.low with transfer.high shows more"
+        f"the preset {preset} lies between {low:.3g} and {high:.3g}, from the histogram, and shows nothing of values "
+        f"below {hidden:.3g}: look at it with holotorch check --preview; values from {lower[2]} on, for example, are "
+        f"shown by 'transfer={{preset: {preset}, low: {lower[0]}, high: {lower[1]}}}'"
     )
 
 
 def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     notes = list(dict.fromkeys(note for plan in experiment.plans for note in plan.notes))
+    if experiment.settings.tolerance is None and experiment.settings.hologram.tolerance is None:
+        # Pictures hardly depend on it, and nobody asked for a field of a certain accuracy.
+        notes = [note for note in notes if note != EDGE_MATTERS]
     if slab_error > _COARSE_SLABS:
         twice = 2 * len(experiment.depths) * experiment.settings.scale
         notes.append(

@@ -3,12 +3,14 @@
 import json
 import re
 
+import numpy as np
 import pytest
 from paths import CONFIGS
 from tiny_runs import VOLUME, command
 
 from holotorch.cli import main
 from holotorch.experiments.execute import check
+from holotorch.experiments.joint.config import MOST_PLANES
 from holotorch.experiments.joint.experiment import JointExperiment, build
 from holotorch.experiments.joint.measured import joint_errors
 from holotorch.experiments.registry import load_config
@@ -44,6 +46,17 @@ def test_planes_that_are_slices_of_a_volume_rather_than_the_volume_are_noted():
     assert f"2 planes are {error:.0%} off" in note and "; display.planes=" in note
     with_slabs = check(settings("display.planes=2", "frames=2", "report.baselines=[slabs]"))
     assert re.search(r"; display.planes=(\d+) frames=\1 would be \d+% off", with_slabs.text)
+
+
+def test_no_note_proposes_more_planes_than_a_run_takes():
+    """160 planes are as far off this volume as 5: rays of it end at different voxels."""
+    words = "transfer={points: [[0, 1, 1, 1, 0], [254, 1, 1, 1, 0], [255, 1, 1, 1, 1]]}"
+    for planes in (5, MOST_PLANES // 2, MOST_PLANES):
+        text = check(settings(f"display.planes={planes}", words)).text
+        proposed = [int(each) for each in re.findall(r"display\.planes=(\d+)", text)]
+        assert all(planes < each <= MOST_PLANES for each in proposed)
+        if planes == MOST_PLANES and "off this volume" in text:
+            assert "more of them are not accepted" in text
 
 
 def test_a_volume_wider_than_the_array_is_noted_with_the_width_that_fits():
@@ -103,3 +116,26 @@ def test_a_finished_run_has_measured_beside_predicted_errors(tmp_path):
     assert summary["measured_error"] is not None and summary["predicted_error"] > 0
     assert [each["part"] for each in summary["errors"]] == ["heat", "planes", "propagation", "stopping"]
     assert "Relative L2 error. heat" in (tmp_path / "a" / "report.html").read_text()
+
+
+def test_the_phase_per_kelvin_of_a_joint_run_may_be_given_at_any_wavelength():
+    texts = [
+        check(settings("display.max_temperature=300 degC", f"display.rad_per_K={value}", *at)).values
+        for value, at in ((0.02, ()), (0.02 * 630 / 525, ("display.rad_per_K_at=525 nm",)))
+    ]
+    limits = [
+        settings("display.max_temperature=300 degC", *words).limit
+        for words in (
+            ("display.rad_per_K=0.02",),
+            (f"display.rad_per_K={0.02 * 630 / 525}", "display.rad_per_K_at=525 nm"),
+        )
+    ]
+    assert limits[0] == pytest.approx(limits[1]) and texts[0]["stop_below"] == texts[1]["stop_below"]
+
+
+def test_a_measured_kernel_of_a_joint_run_states_noise_and_missing_heat(tmp_path):
+    y, x = np.mgrid[-3:4, -3:4]
+    rise = np.exp(-np.hypot(y, x)) + 0.004 * np.random.default_rng(1).normal(size=y.shape)
+    np.savetxt(tmp_path / "kernel.csv", rise.clip(0) / rise.max(), delimiter=",")
+    text = check(settings(f"display.kernel={tmp_path / 'kernel.csv'}")).text
+    assert "differ as by noise of 0.00" in text and "the measured kernel is cut off" in text

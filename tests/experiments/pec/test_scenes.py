@@ -282,3 +282,41 @@ def test_noise_in_a_measured_kernel_is_tried_on_four_chips(tmp_path):
         formed = seen(array.far(np.exp(1j * np.array(heat)))) * target.mean((1, 2), keepdims=True)
         assert psnr == pytest.approx(np.mean([array.psnr(formed[c], target[c]) for c in range(3)]), rel=1e-6)
         assert ssim == pytest.approx(np.mean([array.ssim(formed[c], target[c]) for c in range(3)]), abs=1e-6)
+
+
+def test_heat_beyond_the_table_of_a_measured_kernel_is_tried(tmp_path):
+    y, x = np.mgrid[-2:3, -2:3]
+    np.save(tmp_path / "kernel.npy", np.exp(-np.hypot(y, x)))
+    words = [f"modulator={{kernel: {tmp_path / 'kernel.npy'}}}", "frames=2"]
+    assert execute(settings(*words), tmp_path / "run")[1]
+    corrected = json.loads((tmp_path / "run" / "summary.json").read_text())["methods"]["corrected"]
+    numbers = corrected["kernel_continued"]
+    assert numbers["taps"] == [15, 15]  # exp(-7) is the last above a thousandth
+    phase, target = (np.load(tmp_path / "run" / "arrays" / f"{name}.npy") for name in ("phase", "target"))
+    y, x = np.mgrid[-7:8, -7:8]
+    whole = np.exp(-np.hypot(y, x))
+    heat = [[convolve(one, whole, mode="constant") for one in frame] for frame in phase.astype(float)]
+    formed = seen(array.far(np.exp(1j * np.array(heat)))) * target.mean((1, 2), keepdims=True)
+    assert numbers["ssim_mean"] == pytest.approx(
+        np.mean([array.ssim(formed[c], target[c]) for c in range(3)]), abs=1e-6
+    )
+    assert numbers["ssim_mean"] < corrected["ssim_mean"]
+    assert "if the rise falls on beyond it" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_a_table_that_holds_the_heat_is_not_continued(tmp_path):
+    np.save(tmp_path / "kernel.npy", array.spread(np.pad([[1.0]], 3), 0.66, 7))
+    assert execute(settings(f"modulator={{kernel: {tmp_path / 'kernel.npy'}}}"), tmp_path / "run")[1]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert "kernel_continued" not in summary["methods"]["corrected"]
+
+
+def test_pictures_of_fewer_frames_or_too_much_heat_say_so(tmp_path, monkeypatch):
+    captions = []
+    monkeypatch.setattr(
+        "holotorch.experiments.pec.run.figures.comparison", lambda pictures, names: captions.extend(names) or b""
+    )
+    words = ["modulator={sigma_px: 0.66, max_temperature: 200 degC}", "frames=2", "report.baselines=[none]"]
+    assert execute(settings(*words), tmp_path / "run")[1]
+    assert [name.split(", ", 2)[-1] for name in captions[1:2]] == ["1 frame, above the limit"]
+    assert "frame" not in captions[2] and "limit" not in captions[2]

@@ -1,6 +1,7 @@
 """A look at an own volume before any hologram: preview, presets from the histogram, and the same keys in eye runs."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -34,7 +35,10 @@ def test_a_preset_without_values_lies_between_air_and_the_brightest(scan, capsys
     colour, opacity = experiment.transfer(torch.tensor([21.0, 201.0]))
     assert opacity[0] == 0 < opacity[1]
     assert main(["check", *words]) == 0
-    assert "the preset bone lies between" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "the preset bone lies between" in said
+    (proposed,) = re.findall(r"shown by '(transfer=.*?)'", said)
+    assert main(["check", *words[:-1], proposed]) == 0 and "the preset bone lies" not in capsys.readouterr().out
     assert main(["check", *words[:-1], "transfer={preset: bone, low: 3}"]) == 2
     assert "expected both low and high, or neither" in capsys.readouterr().err
     assert main(["check", *words[:-1], "transfer=bone", "transfer.low=30", "transfer.high=180"]) == 0

@@ -1,0 +1,76 @@
+"""What a measured heat kernel tells of its own errors: its noise, and the heat beyond its table."""
+
+import math
+
+import torch
+from torch import Tensor
+
+NOISY = 2e-4  # noise of a kernel above which it is stated; a thousandth costs little (correct_my_chip.md)
+_WARM = 0.02  # mean rise along a side, relative to the centre, above which heat is missing
+_FAINT = 1e-3  # rise beyond the table, relative to the centre, below which it is left out
+_LEAST = 1e-6  # rise of a tap, relative to the centre, whose logarithm is taken for a smaller one
+
+
+def outer_noise(kernel: Tensor) -> float:
+    """Noise of the taps of a kernel [h, w], relative to its centre: of the outermost ring, where heat is least.
+
+    Heat spreads as far to one side as to the opposite one, so that opposite taps of the ring differ by noise alone.
+    """
+    ring = _ring(kernel, 0)
+    return (kernel - kernel.flip((0, 1)))[ring].square().mean().div(2).sqrt().item()
+
+
+def warm_ring(kernel: Tensor) -> float:
+    """Largest mean rise along a side of a kernel [h, w], relative to its centre."""
+    middle = kernel[kernel.shape[0] // 2, kernel.shape[1] // 2]
+    sides = [side.mean() for side in (kernel[0], kernel[-1], kernel[:, 0], kernel[:, -1]) if kernel.numel() > len(side)]
+    return float(max(sides, default=0.0 * middle) / middle)
+
+
+def is_cut_off(kernel: Tensor) -> bool:
+    """Whether much heat spreads beyond the table of a measured kernel."""
+    return warm_ring(kernel) > _WARM
+
+
+def cut_off_note(kernel: Tensor) -> list[str]:
+    """A note on a measured kernel whose table ends where it is still warm; empty for another."""
+    if not is_cut_off(kernel):
+        return []
+    return [
+        f"the measured kernel is cut off where the rise is still {warm_ring(kernel):.1%} of that of its centre: the "
+        "heat beyond is not in the model; give more rows and columns, or subtract what is not heat"
+    ]
+
+
+def continued(kernel: Tensor, shape: tuple[int, ...]) -> Tensor | None:
+    """A measured kernel with the heat beyond its table, which falls on as it does towards the table's sides.
+
+    The rise beyond is exp(a - r / length), with r the distance from the centre in pixels and a and length fitted to the
+    two outermost rings; it goes on to a thousandth of the centre, or to ``shape``. A guess, which only tells how much
+    the missing heat may matter. None for a kernel that does not fall towards its sides.
+    """
+    kernel = kernel.detach().cpu().double()
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in kernel.shape)
+    distance, rings = torch.hypot(y[:, None], x), _ring(kernel, 0) | _ring(kernel, 1)
+    if not min(kernel.shape) > 4:
+        return None
+    fitted = torch.stack([torch.ones_like(distance[rings]), -distance[rings]], 1)
+    start, fall = torch.linalg.lstsq(fitted, kernel[rings].clamp(min=_LEAST).log()[:, None]).solution[:, 0].tolist()
+    if not fall > 0:
+        return None
+    reach = math.ceil((start - math.log(_FAINT)) / fall)
+    sides = [max(n, min(2 * reach + 1, 2 * ((most - 1) // 2) + 1)) for n, most in zip(kernel.shape, shape, strict=True)]
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in sides)
+    whole = torch.exp(start - fall * torch.hypot(y[:, None], x))
+    top, left = ((side - n) // 2 for side, n in zip(sides, kernel.shape, strict=True))
+    whole[top : top + kernel.shape[0], left : left + kernel.shape[1]] = kernel
+    return whole
+
+
+def _ring(kernel: Tensor, depth: int) -> Tensor:
+    """The taps of a kernel [h, w] that lie ``depth`` rows or columns within its sides, bool [h, w]."""
+    height, width = kernel.shape
+    ring = torch.zeros_like(kernel, dtype=torch.bool)
+    ring[depth : height - depth, depth : width - depth] = True
+    ring[depth + 1 : height - depth - 1, depth + 1 : width - depth - 1] = False
+    return ring

@@ -1,0 +1,37 @@
+"""The heat beyond the table of a measured kernel: a guess that is right where the heat falls exponentially."""
+
+import numpy as np
+import pytest
+import torch
+
+from holotorch.experiments.planning.heat_kernel import continued, cut_off_note, is_cut_off
+
+
+def rises(height: int, width: int, length: float = 2.0) -> torch.Tensor:
+    """exp(-r / length) around the centre; ``length`` in pixels."""
+    y, x = (np.arange(n) - n // 2 for n in (height, width))
+    return torch.from_numpy(np.exp(-np.hypot(y[:, None], x) / length))
+
+
+def test_an_exponential_goes_on_to_a_thousandth_of_the_centre():
+    whole = continued(rises(7, 9), (101, 101))
+    assert whole is not None and whole.shape == (29, 29)  # exp(-14 / 2) is 9e-4
+    assert torch.allclose(whole, rises(29, 29), rtol=1e-9)
+
+
+def test_the_taps_of_the_table_stay_and_the_rest_ends_at_the_array():
+    table = rises(7, 9) * (1 + 0.1 * torch.rand(7, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    whole = continued(table, (16, 11))
+    assert whole is not None and whole.shape == (15, 11)
+    assert torch.equal(whole[4:11, 1:10], table)
+
+
+def test_a_kernel_that_does_not_fall_is_not_continued():
+    assert continued(torch.ones(7, 7, dtype=torch.float64), (32, 32)) is None
+    assert continued(rises(3, 3), (32, 32)) is None  # two rings are the whole table
+
+
+@pytest.mark.parametrize(("length", "cut"), [(0.7, False), (1.5, True)])
+def test_a_table_that_ends_while_it_is_warm_is_noted(length, cut):
+    kernel = rises(7, 7, length)
+    assert is_cut_off(kernel) == cut == bool(cut_off_note(kernel))
