@@ -35,11 +35,15 @@ from holotorch.experiments.volume.experiment import build as build_volume
 from holotorch.hologram import incoherent_views
 from holotorch.modulator import HeatCycle, ThermalCrosstalk
 from holotorch.optics import PupilViews, View, disc_source, propagate
+from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.optics.viewing.pupil_views import view_padding
 from holotorch.scene.layers import SlabLayers, SourceLayers
 
 _PENALTY_FROM = 0.985  # fraction of the limit above which phases are penalised, so that little is left to scale down
 _TOLERANCE = 3e-3  # relative L2 error of the fields that the start is made of
+# Distance of the corrected foci in depths of focus. 40 planes of a head (one colour, 60 steps) then have 51.3 dB over
+# all of them and 49.4 at worst; with a focus on each, 50.2 and 42.9, in nine times the time; at 0.78, 50.3 and 47.4.
+_APART = 0.5
 _RINGS = 2  # rings of directions within a pupil, for the occlusion between planes
 _VIEWS_SEED = 1 << 40  # added to the seed for the random pupils, so that they are independent of the start
 
@@ -154,8 +158,18 @@ class JointExperiment:
 
     @cached_property
     def foci(self) -> list[float]:
-        """Focal distances that are corrected: the depths of the planes, nearest first."""
-        return sorted(self.depths)
+        """Focal distances that are corrected, nearest first: the depths of the planes, or fewer of the same extent.
+
+        Where planes are closer than ``_APART`` depths of focus, their pictures hardly differ; foci that far apart take
+        less time and correct all of them as well (see ``scripts/docs/joint.md``).
+        """
+        planes = sorted(self.depths)
+        apart = _APART * depth_of_focus(min(self.settings.wavelengths), self.radius)
+        count = math.ceil((planes[-1] - planes[0]) / apart) + 1
+        if count >= len(planes):
+            return planes
+        step = (planes[-1] - planes[0]) / max(count - 1, 1)
+        return [planes[0] + step * i for i in range(count)]
 
     @cached_property
     def stack(self) -> Views:

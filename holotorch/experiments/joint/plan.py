@@ -1,6 +1,7 @@
 """The plan of a joint run: cost and physics, before anything is optimised."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -32,6 +33,7 @@ def plan_values(experiment: JointExperiment) -> dict[str, Any]:
     peak = _BASE_BYTES + (_SAMPLE_BYTES * samples + kernels) * math.prod(padded) + experiment.scene.volume.values.nbytes
     return {
         "volume": {"shape": list(experiment.scene.volume.shape), "synthetic": experiment.scene.synthetic},
+        "planes_mm": [depth * 1e3 for depth in sorted(experiment.depths)],
         "foci_mm": [focus * 1e3 for focus in foci],
         "stretched": experiment.stretched,
         "pupil_deg": 2 * math.degrees(math.asin(experiment.radius)),
@@ -70,17 +72,21 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     usual = display.rad_per_K == type(display).model_fields["rad_per_K"].default
     thesis = ", that of the thesis's chip" if usual else ""
     memory = "" if heat is None else f"; {_left(settings):.1%} of the heat is left after a frame"
+    fewer = ""
+    if (count := len(values["foci_mm"])) < len(values["planes_mm"]):
+        fewer = f"; {count} foci, half a depth of focus apart, stand for those of all planes"
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {experiment.scene.width * 1e3:.3g} mm "
-        f"wide, on {len(values['foci_mm'])} planes from "
-        f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
+        f"wide, on {len(values['planes_mm'])} planes from "
+        f"{values['planes_mm'][0]:.4g} to {values['planes_mm'][-1]:.4g} mm{stretched}",
         f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient "
         f"(display.rad_per_K={display.rad_per_K:.4g} at {display.rad_per_K_at * 1e9:.4g} nm{thesis}){memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
-        f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the pupil",
+        f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the "
+        f"pupil{fewer}",
         f"Solver     {_steps(values, experiment)}; compared with {_compared(settings)}",
         f"{experiment.budget.text}; {values['taps']} taps, {values['precision']} in the solver",
         f"Cost       about {duration(values['predicted_seconds'])} ({seconds_in_words(values['seconds_of'])}); "
@@ -122,10 +128,10 @@ def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
 
     Never more than ``MOST_PLANES``.
     """
-    count, error = len(experiment.foci), math.inf
+    count, error = len(experiment.depths), math.inf
     for factor in (2, 4, 8):
         if error > FEW_PLANES and count < MOST_PLANES:
-            count = min(MOST_PLANES, factor * len(experiment.foci))
+            count = min(MOST_PLANES, factor * len(experiment.depths))
             more = with_planes(experiment.scene, experiment.settings, count)
             error = more.sampler().slab_error(more.volume)
     return count, error
@@ -133,7 +139,7 @@ def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
 
 def _few_planes(experiment: JointExperiment, error: float) -> str:
     """A note on planes that are ``error`` off the volume, and on what is closer."""
-    settings, count = experiment.settings, len(experiment.foci)
+    settings, count = experiment.settings, len(experiment.depths)
     shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
     words = f"{count} planes are {error:.0%} off this volume: the array forms their pictures, which show {shown}; "
     if count >= MOST_PLANES:
@@ -143,10 +149,12 @@ def _few_planes(experiment: JointExperiment, error: float) -> str:
     names = settings.report.baselines
     frames = f" frames={more}" if "slabs" in names and names != BASELINES else ""
     still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
-    fewer = "" if settings.eye.per_step else " and memory"
+    now, then = (
+        sum(seconds_of(each, machine_speed(experiment.device)).values())
+        for each in (experiment, replace(experiment, scene=with_planes(experiment.scene, settings, more)))
+    )
     return (
-        f"{words}display.planes={more}{frames} would be {left:.0%} off, in about {more / count:.2g} times the "
-        f"time{fewer}{still}"
+        f"{words}display.planes={more}{frames} would be {left:.0%} off, in about {then / now:.2g} times the time{still}"
     )
 
 

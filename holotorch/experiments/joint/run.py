@@ -80,6 +80,8 @@ def _fingerprint(experiment: JointExperiment) -> Fingerprint:
         free.add("eye.per_step")  # checkpoints of before there was one do not have it
     else:
         free.remove("steps")  # the learning rate falls over the steps
+    if len(experiment.foci) < len(experiment.depths):  # checkpoints of before corrected every plane
+        inputs["display.foci"] = (repr(experiment.foci),)
     if settings.eye.parallax:
         inputs["eye.parallax"] = (repr(experiment.trained.operator.views),)
     if settings.display.rad_per_K_at == type(settings.display).model_fields["rad_per_K_at"].default:

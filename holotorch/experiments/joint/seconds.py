@@ -69,20 +69,20 @@ def shown_seconds(experiment: JointExperiment, machine: Machine) -> float:
 
 def seconds_of(experiment: JointExperiment, machine: Machine) -> dict[str, float]:
     """Seconds of each part of the whole command; the factors of the other methods are relative to the solver."""
-    settings, planes = experiment.settings, len(experiment.foci)
+    settings, planes, foci = experiment.settings, len(experiment.depths), len(experiment.foci)
     colours, fields = len(settings.wavelengths), settings.frames * len(settings.wavelengths)
-    transform, pixels, scored = _transform(experiment, machine), math.prod(experiment.grid.shape), 6 * planes - 1
-    sweep = SWEEP if planes > 1 else 1
+    transform, pixels, scored = _transform(experiment, machine), math.prod(experiment.grid.shape), 6 * foci - 1
+    sweep = SWEEP if foci > 1 else 1
     start = _SOURCES * fields * planes * pixels * math.log2(pixels) * machine.fft(pixels)
     start += _PLANNING * planes * machine.interpreter + _DECONVOLUTION * fields * pixels * machine.elementwise
     step = step_seconds(experiment, machine)
     steps = settings.steps * step
-    wanted = 7 * planes - 1 + settings.eye.parallax + sweep
-    scores = machine.score(colours * planes * pixels, double=False) * scored / planes
+    wanted = 7 * foci - 1 + settings.eye.parallax + sweep
+    scores = machine.score(colours * foci * pixels, double=False) * scored / foci
     evaluated = _SHOWN * fields * scored * transform + scores
     wanted += CIRCLES if "light_field" in settings.comparisons else 0
     others, shown = settings.comparisons, 2 + len(settings.comparisons)
-    pictures = 2 * _SWEEP_PIXEL * pixels * max(1, 2 * sweep - 2) + _PANEL * shown * (planes + 4)
+    pictures = 2 * _SWEEP_PIXEL * pixels * max(1, 2 * sweep - 2) + _PANEL * shown * (foci + 4)
     return {
         "wanted images": _WANTED * colours * planes * wanted * transform,
         "solver": start + steps,

@@ -253,7 +253,7 @@ def test_pictures_of_many_foci_are_a_few(tmp_path, monkeypatch):
 
     monkeypatch.setattr(figures, "picture_table", table)
     words = [*("display.planes=15", "frames=1", "steps=1", "wavelengths=[520 nm]"), SCENE, VOLUME[1], *PLAIN, DISPLAY]
-    words = [*words[4:], *words[:4]]
+    words = [*words[4:], *words[:4], "eye.pupil=0.9"]  # as wide, each plane needs a focus
     assert execute(load_config(TEAPOT, words), tmp_path / "a", "a")[1]
     assert drawn["0"] == (8, [f"{each:.4g} mm" for each in (2.267, 3.333, 4.4, 5.467, 6.533, 7.6, 8.667, 9.733)])
 

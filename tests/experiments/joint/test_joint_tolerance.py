@@ -5,14 +5,17 @@ import re
 
 import numpy as np
 import pytest
+import torch
 from paths import CONFIGS
 from tiny_runs import VOLUME, command
 
 from holotorch.cli import main
+from holotorch.correction.problem import best_scale
 from holotorch.experiments.execute import check
 from holotorch.experiments.joint.config import MOST_PLANES
 from holotorch.experiments.joint.experiment import JointExperiment, build
 from holotorch.experiments.joint.measured import joint_errors
+from holotorch.experiments.joint.methods import show
 from holotorch.experiments.registry import load_config
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -32,7 +35,7 @@ def parts(values) -> dict[str, dict]:
 
 def test_without_a_tolerance_nothing_changes():
     plan = check(settings())
-    assert len(plan.values["foci_mm"]) == 5 and plan.values["stop_below"] == 0 and "L-BFGS, 60 steps" in plan.text
+    assert len(plan.values["planes_mm"]) == 5 and plan.values["stop_below"] == 0 and "L-BFGS, 60 steps" in plan.text
     assert plan.values["taps"] == 5 and plan.values["precision"] == "complex64"
     assert list(parts(plan.values)) == ["heat", "planes", "propagation"] and "by default" in plan.text
     assert "thin parts of it broken" in plan.text and "slices of it" not in plan.text  # 5 planes are 37 % off
@@ -46,6 +49,35 @@ def test_planes_that_are_slices_of_a_volume_rather_than_the_volume_are_noted():
     assert f"2 planes are {error:.0%} off" in note and "; display.planes=" in note
     with_slabs = check(settings("display.planes=2", "frames=2", "report.baselines=[slabs]"))
     assert re.search(r"; display.planes=(\d+) frames=\1 would be \d+% off", with_slabs.text)
+
+
+@pytest.mark.parametrize(("planes", "foci"), [(4, 4), (8, 8), (9, 8), (40, 9), (200, 9)])
+def test_planes_within_a_depth_of_focus_share_foci(planes, foci):
+    """520 nm, sine 0.0202: a depth of focus of 1.27 mm; 40 planes span 4.875 mm, and 200 of them 4.975 mm."""
+    plan = check(settings(f"display.planes={planes}", "eye.pupil=0.7")).values
+    span = plan["planes_mm"][0], plan["planes_mm"][-1]
+    apart = plan["depth_of_focus_mm"] / 2
+    assert len(plan["planes_mm"]) == planes and len(plan["foci_mm"]) == plan["views"] == foci
+    assert (plan["foci_mm"][0], plan["foci_mm"][-1]) == pytest.approx(span)
+    assert np.diff(plan["foci_mm"]) == pytest.approx((span[1] - span[0]) / (foci - 1))
+    assert foci == planes or (span[1] - span[0]) / (foci - 1) <= apart < (span[1] - span[0]) / max(foci - 2, 1e-9)
+
+
+def test_fewer_foci_correct_all_planes_as_well():
+    """The pictures at each of 24 planes, by a focus on each and by those half a depth of focus apart."""
+    words = "display.planes=24", "steps=30", "frames=3"
+    few = build(settings(*words))
+    every = build(settings(*words))
+    every.__dict__["foci"] = sorted(every.depths)
+    scores = []
+    for experiment in (few, every):
+        shown = show(experiment, experiment.solve().x)
+        with torch.no_grad():
+            images = shown.images(every.stack.operator)
+        images = images * best_scale(images, every.stack.images, -3)[:, None, None, None]
+        scores.append(float((images - every.stack.images).square().mean().sqrt()))
+    assert len(few.foci) < 10 < len(every.foci)
+    assert scores[0] < 1.1 * scores[1]
 
 
 def test_no_note_proposes_more_planes_than_a_run_takes():
@@ -69,7 +101,7 @@ def test_a_volume_wider_than_the_array_is_noted_with_the_width_that_fits():
 
 def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():
     loose, tight = (check(settings(f"tolerance={each}")) for each in (0.5, 0.05))
-    assert len(loose.values["foci_mm"]) < len(tight.values["foci_mm"]) <= 64
+    assert len(loose.values["planes_mm"]) < len(tight.values["planes_mm"]) <= 64
     assert loose.values["samples"] < tight.values["samples"]
     assert loose.values["stop_below"] > tight.values["stop_below"] > 0
     assert loose.values["taps"] <= tight.values["taps"] <= 5
@@ -79,9 +111,9 @@ def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():
 
 def test_a_number_of_planes_wins_and_slabs_take_no_more_than_there_are_frames():
     given = check(settings("tolerance=0.05", "display.planes=3"))
-    assert len(given.values["foci_mm"]) == 3 and parts(given.values)["planes"]["from"] == "display.planes"
+    assert len(given.values["planes_mm"]) == 3 and parts(given.values)["planes"]["from"] == "display.planes"
     assert "exceeds it" in given.text
-    assert len(check(settings("tolerance=0.05", "report.baselines=[slabs]")).values["foci_mm"]) == 4
+    assert len(check(settings("tolerance=0.05", "report.baselines=[slabs]")).values["planes_mm"]) == 4
 
 
 @pytest.mark.parametrize(
