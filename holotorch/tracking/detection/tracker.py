@@ -54,7 +54,8 @@ class ErrorFloors:
     """
 
     model: float = 0.004  # every edge: the edge profile and the sampling by pixels are approximate
-    texture: float = 0.5  # outermost edges: per variation of the background, seen through the clear tube beside them
+    transparency: float = 0.010  # outermost edges: the background is visible through the clear tube beside them
+    texture: float = 0.5  # outermost edges: per variation of the background relative to the edge's step of light
     bulge: float = 0.004  # common to all edges of a frame: per pixel by which a ring's front bulges along the line
     shared: float = 0.010  # common to all edges, too
     defocus: float = 0.08  # per pixel of blur in all directions, which lets light from beside the tube leak in
@@ -598,8 +599,10 @@ class CatheterTracker(nn.Module):
             _FLOORS.defocus * min(soft, smeared),
             _FLOORS.smear * smeared,
         )
+        through = [n in (0, last) for n in known]
         along = [
-            math.hypot(edges.deviation[n], floor, (n in (0, last)) * _FLOORS.texture * edges.texture[n]) for n in known
+            math.hypot(deviation, floor, outer * _FLOORS.transparency, outer * _FLOORS.texture * texture)
+            for deviation, texture, outer in zip(edges.deviation[known], edges.texture[known], through, strict=True)
         ]
         # Shading that is constant along the tube shifts and rotates the line by more than the deviations of its fit.
         # Both deviations, expressed as displacements at the edges, are therefore raised to the larger one.
