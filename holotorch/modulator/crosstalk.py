@@ -92,10 +92,10 @@ class ThermalCrosstalk(PreciseModule):
         """Build from a measured response: the temperature rises [h, w] around one heated pixel in the centre.
 
         h and w are odd. The rises have any unit, since they are divided by that of the centre; they need not be
-        symmetric. An ``nn.Parameter`` is learned, and with ``learnable`` the rises become one, divided by that of the
-        centre, so that the learning rate does not depend on their unit; they are in ``state_dict`` as ``patch``.
-        Raises ValueError for even sizes, NaN, negative rises, a centre that is not the warmest, or a patch with a
-        gradient that is no Parameter.
+        symmetric. They are kept as ``patch``, and with ``learnable`` become a Parameter, whose learning rate then does
+        not depend on their unit; only ratios to its centre count. An ``nn.Parameter`` is learned as it is. Raises
+        ValueError for even sizes, NaN, negative rises, a centre that is not the warmest, or a patch with a gradient
+        that is no Parameter.
         """
         if isinstance(patch, str | Path):
             table = "torch.from_numpy(numpy.loadtxt(file, delimiter=','))"
@@ -113,7 +113,7 @@ class ThermalCrosstalk(PreciseModule):
         self = cls(0.0)
         del self.sigma, self.patch
         self.sigma, self.size_is_given = None, True
-        given = patch / centre if learnable and not isinstance(patch, nn.Parameter) else patch
+        given = patch if isinstance(patch, nn.Parameter) else patch / centre
         self.learned = self.record("patch", given, learnable=learnable)
         self._keep_taps()
         return self

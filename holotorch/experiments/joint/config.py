@@ -113,6 +113,7 @@ class JointSettings(Settings):
     elsewhere: ClassVar[dict[str, str]] = {
         "modulator": "display describes the chip, by sigma_px or kernel, max_phase or max_temperature, and rad_per_K",
         "hologram": "display has shape, pitch, distance and planes",
+        "solver": "steps is the largest number of steps",
         "scale": "the chip keeps its size; fewer pixels by display.shape, with a view.width to match, take less time",
     }
 

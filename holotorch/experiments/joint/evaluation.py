@@ -12,6 +12,7 @@ from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.methods import Shown
 from holotorch.metrics import ssim
 
+_AT_LIMIT = 0.97  # fraction of the limit above which it is what bounds the phases
 _BRIGHT = 0.3  # fraction of the peak of the wanted images above which a pixel counts in the contrast
 
 
@@ -37,7 +38,8 @@ def evaluate(experiment: JointExperiment, shown: Shown) -> tuple[dict[str, Any],
         field = experiment.stack.operator(shown.fields)[:, :, len(experiment.foci) // 2]
         numbers["light_in_pupil"] = (intensity(field).sum() / intensity(shown.fields).sum()).item()
         if shown.phase is not None:
-            numbers["peak_phase_pi"] = experiment.heat(shown.phase).max().item() / math.pi
+            peak = experiment.heat(shown.phase).max().item()
+            numbers |= {"peak_phase_pi": peak / math.pi, "at_limit": peak > _AT_LIMIT * experiment.settings.limit}
     return numbers, images
 
 

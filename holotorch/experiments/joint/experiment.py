@@ -84,9 +84,12 @@ class JointExperiment:
 
     @cached_property
     def depths(self) -> tuple[float, ...]:
-        """Depths of the planes in metres, stretched along the axis, in the order in which rays meet them."""
-        middle = self.settings.display.distance
-        return tuple(middle + self.stretched * (depth - middle) for depth in self.scene.depths)
+        """Depths of the planes behind the array in metres, stretched along the axis, in the order of an eye's rays.
+
+        The array forms the volume behind itself, so that the end that faces the observer (``view.front``) is nearest.
+        """
+        middle, towards = self.settings.display.distance, -1 if self.settings.view.front == "far" else 1
+        return tuple(middle + towards * self.stretched * (depth - middle) for depth in self.scene.depths)
 
     @property
     def stretched(self) -> float:

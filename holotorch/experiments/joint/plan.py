@@ -78,7 +78,8 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {experiment.scene.width * 1e3:.3g} mm "
         f"wide, on {len(values['planes_mm'])} planes from "
-        f"{values['planes_mm'][0]:.4g} to {values['planes_mm'][-1]:.4g} mm{stretched}",
+        f"{values['planes_mm'][0]:.4g} to {values['planes_mm'][-1]:.4g} mm behind the array, its "
+        f"front nearest{stretched}",
         f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "

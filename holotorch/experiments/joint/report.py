@@ -17,6 +17,7 @@ _PICTURES = {
 }
 
 
+_POOR = 30.0  # dB of the corrected pictures below which a binding limit is named
 _LITTLE = 0.05  # share of the light in pupil and window below which that is said beside the scores
 
 
@@ -32,6 +33,12 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
         best = max(others, key=others.__getitem__)
         ideal = " (no chip shows such fields)" if best == "random" else ""
         scores.append(f"the best other method, {NAMES[best]}{ideal}: {others[best]:.1f} dB at the corrected foci")
+    poor = []
+    if corrected.get("at_limit") and corrected["stack_psnr"] < _POOR:
+        poor.append(
+            "Note       the phases are at their limit: a higher one (display.max_temperature or max_phase), more "
+            "frames or a narrower spread of the heat come closer"
+        )
     error, of, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), "", []
     if error > FEW_PLANES:
         shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
@@ -40,7 +47,7 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
             "come closer"
         )
         of = f", of pictures that are {error:.0%} off the volume"
-    return [*notes, f"Result     PSNR {'; '.join(scores)}{of}", *error_line(summary)]
+    return [*notes, f"Result     PSNR {'; '.join(scores)}{of}", *poor, *error_line(summary)]
 
 
 def joint_section(record: RunRecord) -> list[str]:

@@ -94,7 +94,8 @@ def _fingerprint(experiment: JointExperiment) -> Fingerprint:
         free.add("tolerance")  # checkpoints of before there was one do not have it
     if settings.tolerance is None or settings.display.planes is not None:
         free.add("report")  # otherwise the number of planes depends on the methods of comparison, see budget.py
-    return fingerprint(settings, inputs, free)
+    # Checkpoints of before, of volumes whose hidden end was nearest to the eye, lack this entry.
+    return fingerprint(settings, inputs, free) | {"view": "the end that faces the observer is nearest to the array"}
 
 
 class Log:

@@ -23,10 +23,6 @@ from holotorch.modulator.panel import PhaseModulator
 
 FORMATS = ("png", "bmp", "exr")
 # Entry "content" of export.json for a run of kind ``pec``.
-_AFTER_SPREADING = (
-    "phase after the heat has spread, modulo 2 pi, for a liquid-crystal panel; for the heaters of a thermal chip use "
-    "holotorch export-heaters, or arrays/phase.npy, [F, C, H, W] in rad before spreading and not modulo 2 pi"
-)
 
 
 def export_slm(
@@ -75,7 +71,7 @@ def export_slm(
             "source": str(folder),
             "panel": settings.model_dump(mode="json", exclude_none=True),
             "encoding": source.encoding,
-            **({"content": _AFTER_SPREADING} if source.encoding == "phase" else {}),
+            **({"content": source.content} if source.content else {}),
             "format": form,
             "files": sum(names, []),
             "padded": source.grid.shape != panel.grid.shape,

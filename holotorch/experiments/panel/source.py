@@ -31,6 +31,16 @@ ENCODINGS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
+_AFTER_SPREADING = (
+    "phase after the heat has spread, modulo 2 pi, for a liquid-crystal panel; for the heaters of a thermal chip use "
+    "holotorch export-heaters, or arrays/phase.npy, [F, C, H, W] in rad before spreading and not modulo 2 pi"
+)
+_FAR_END = (
+    "phases that form the volume behind the panel, where the end that was rendered (view.front=far) is the hidden one: "
+    "its depth is inverted for an observer in front of the panel; view.front=near is right for him"
+)
+
+
 @dataclass(frozen=True)
 class PanelPhases:
     """Phases for a panel, and the picture that they form.
@@ -44,6 +54,7 @@ class PanelPhases:
             over the F frames.
         losses: Relative squared error of the picture by name of the encoding, for ``encoding`` and the kinoform,
             without an aperture, one value per colour; empty if the run computed phases.
+        content: What a user of the phases must know, or an empty text.
     """
 
     phase: Tensor
@@ -52,6 +63,7 @@ class PanelPhases:
     encoding: str
     picture: Callable[[Tensor], Tensor]
     losses: dict[str, list[float]] = field(default_factory=dict)
+    content: str = ""
 
 
 def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
@@ -116,7 +128,7 @@ def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
         formed = [intensity(experiment.propagator(field.to(experiment.device))) for field in fields]
         return experiment.picture_in(torch.stack(formed).mean(0)).cpu()
 
-    return PanelPhases(phase, experiment.wavelengths, experiment.grid, "phase", picture)
+    return PanelPhases(phase, experiment.wavelengths, experiment.grid, "phase", picture, content=_AFTER_SPREADING)
 
 
 def _from_joint(folder: Path, settings: JointSettings) -> PanelPhases:
@@ -128,7 +140,7 @@ def _from_joint(folder: Path, settings: JointSettings) -> PanelPhases:
         return Shown(fields.to(experiment.device)).images(experiment.stack.operator)[:, middle].cpu()
 
     phase = experiment.heat(heaters.double().to(experiment.device)).float().cpu()
-    return PanelPhases(phase, settings.wavelengths, experiment.grid, "phase", picture)
+    return PanelPhases(phase, settings.wavelengths, experiment.grid, "phase", picture, content=_AFTER_SPREADING)
 
 
 def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> PanelPhases:
@@ -149,7 +161,8 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
         name: [encoding_loss(hologram[c], phases[c], propagator(c)).item() for c in range(len(hologram))]
         for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram)))
     }
-    return PanelPhases(phase[None], settings.wavelengths, grid, encoding, picture, losses)
+    content = _FAR_END if settings.view.front == "far" else ""
+    return PanelPhases(phase[None], settings.wavelengths, grid, encoding, picture, losses, content)
 
 
 def _check_axes(folder: Path, experiment: PECExperiment, heaters: Tensor) -> None:

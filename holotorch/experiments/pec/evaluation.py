@@ -16,6 +16,7 @@ from holotorch.metrics import SSIM_WINDOW, dark_spots, psnr, ssim
 from holotorch.modulator import PhasedArray, ThermalCrosstalk
 from holotorch.optics import CroppedKernel
 
+_AT_LIMIT = 0.97  # fraction of the limit above which it is what bounds the phases
 NOISY_KERNELS = 4  # chips on which a run with report.kernel_noise tries its phases
 
 
@@ -137,7 +138,8 @@ def _heating(experiment: PECExperiment, phase: Tensor) -> dict[str, Any]:
         rows.append(torch.stack([spread.amax((-2, -1)), warm.amax((-2, -1)), *means]))
     frames = torch.stack(rows)  # [F, 4, C]
     return {
-        "peak_phase_rad": frames[:, 0].max().item(),
+        "peak_phase_rad": (peak := frames[:, 0].max().item()),
+        "at_limit": experiment.limit is not None and peak > _AT_LIMIT * experiment.limit,
         "peak_temperature_rise_K": _per_colour(experiment, frames[:, 1].amax(0)),
         "mean_temperature_rise_K": _per_colour(experiment, frames[:, 2].mean(0)),
         "heating_power_K_per_pixel": _per_colour(experiment, frames[:, 3].mean(0)),

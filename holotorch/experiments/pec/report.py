@@ -52,6 +52,11 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
     advice = []
     if corrected.get("frames") == 1 and corrected.get("ssim_mean", 1.0) < _POOR:
         advice.append("Note       several frames in turn, whose mean is seen, come closer to the picture: frames=4")
+    elif corrected.get("at_limit") and corrected.get("ssim_mean", 1.0) < _POOR:
+        advice.append(
+            "Note       the phases are at their limit: a higher one (modulator.max_temperature), more frames or a "
+            "nearer picture come closer"
+        )
     return [f"Result     {', '.join(scores)}", *kernel, *advice, *error_line(summary)]
 
 

@@ -165,7 +165,7 @@ _ADVICE = {
     Status.BANDS_MISSING: f"is a band covered? Or {_COLOURS}; {_LONGER}",
     Status.NO_AXIS: _COLOURS,
     Status.TOO_NARROW: _LONGER,
-    Status.EDGES_UNCLEAR: _LONGER,
+    Status.EDGES_UNCLEAR: f"are `edges` right, and the bands named from the tip on? Or {_LONGER}",
     Status.OUT_OF_FRAME: "the bands must lie within the picture",
     Status.OUTSIDE_CAMERA: "the camera's file says nothing there: calibrate with boards near the picture's edges",
     Status.INCONSISTENT: "no pose explains what was measured: are `edges`, `radius` (half the thickness) and camera "

@@ -22,7 +22,7 @@ from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.timing import timed
-from holotorch.experiments.tracking.config import SYNTHETIC, TrackSettings
+from holotorch.experiments.tracking.config import FRAMES, SYNTHETIC, TrackSettings
 from holotorch.experiments.tracking.devices import build_headset, headset_covariance, load_headset
 from holotorch.experiments.tracking.forecast import range_text
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
@@ -178,6 +178,10 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     count = "without end; Ctrl-C ends it" if frames.live else count
     lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
     lines.append(range_text(experiment.inputs.camera, experiment.inputs.catheter))
+    if settings.frames != FRAMES:
+        lines.append(
+            f"Note       frames={settings.frames} is for synthetic recordings; of this source, all are tracked"
+        )
     if settings.record:
         free, rate = free_bytes(Path()), recording_bytes(frames.shape, 1) * frames.rate
         text = f"{rate / 1e6:.1f} MB per second; {free / 1e9:.1f} GB free here, {free / rate:.0f} s"

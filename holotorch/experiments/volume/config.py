@@ -118,7 +118,9 @@ class ViewSettings(Settings):
     about the horizontal axis (x). ``width`` is the length of its longest side in metres, by default the longest side of
     the hologram.
     ``front`` says which end of the volume faces the observer: the one far from the hologram, for a display that forms
-    the scene in front of it, or the near one. Either observer sees the volume as it was scanned, not its mirror image.
+    the scene in front of it (by the conjugate field, as eye runs do), or the near one, for a virtual image behind it.
+    Runs of kind joint put either end next to their array. Either observer sees the volume as it was scanned, not its
+    mirror image.
     ``lighting`` shades points by the gradient of the volume; ``scattering`` in its place gives the volume shadows.
     ``adaptive``: follow all rays only where colours or opacity of every fourth ray differ by more than this.
     """

@@ -89,5 +89,6 @@ def _cost(summary: dict[str, Any]) -> str:
     return (
         f"Holograms took {summary['seconds']:.2f} s, {100 * share:.0f} % of it for rendering, and refocusing them "
         f"{summary['refocus_seconds']:.2f} s. Peak memory {summary['peak_memory_bytes'] / 1e9:.2f} GB. Waves are "
-        "exp(+ikr) / r, so the scene is a virtual image behind the hologram; the conjugate field forms it in front."
+        "exp(+ikr) / r, so the scene is a virtual image behind the hologram, whose depth is right for an observer in "
+        "front of it with view.front=near; the conjugate field forms the scene in front, for view.front=far."
     )

@@ -20,7 +20,7 @@ from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.evaluation import errors, evaluate
 from holotorch.experiments.joint.experiment import build
 from holotorch.experiments.joint.methods import Shown, baseline, show
-from holotorch.experiments.joint.report import joint_section
+from holotorch.experiments.joint.report import joint_outcome, joint_section
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import figures
 from holotorch.hologram import incoherent_views
@@ -344,3 +344,13 @@ def test_a_report_says_that_there_is_little_light_where_that_begins_and_what_to_
     page = " ".join(joint_section(record))  # type: ignore[arg-type]
     assert ("only 4.9% of the light reaches the pupil and the window (said below 5%)" in page) == said
     assert ("light_weight asks the solver for more" in page) == said
+
+
+def test_a_result_names_planes_limit_and_ideal_fields_that_qualify_its_score():
+    methods = {"joint": {"stack_psnr": 20.0, "at_limit": True}, "random": {"stack_psnr": 25.0}}
+    text = "\n".join(joint_outcome({"methods": methods, "measured_error": 0.4}))
+    assert "20.0 dB" in text and "of pictures that are 40% off the volume" in text and "at their limit" in text
+    assert "(no chip shows such fields): 25.0 dB" in text
+    methods = {"joint": {"stack_psnr": 50.0, "at_limit": True}, "afterwards": {"stack_psnr": 25.0}}
+    text = "\n".join(joint_outcome({"methods": methods, "measured_error": 0.05}))
+    assert "off the volume" not in text and "limit" not in text and "no chip" not in text

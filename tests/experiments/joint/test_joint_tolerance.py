@@ -171,3 +171,13 @@ def test_a_measured_kernel_of_a_joint_run_states_noise_and_missing_heat(tmp_path
     np.savetxt(tmp_path / "kernel.csv", rise.clip(0) / rise.max(), delimiter=",")
     text = check(settings(f"display.kernel={tmp_path / 'kernel.csv'}")).text
     assert "differ as by noise of 0.00" in text and "the measured kernel is cut off" in text
+
+
+@pytest.mark.parametrize("front", ["far", "near"])
+def test_what_the_observer_sees_first_is_nearest_to_the_array(front):
+    """An opaque ball, whose visible half lies before its middle, 6 mm behind the array."""
+    opaque = "transfer={points: [[0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [255, 1, 1, 1, 1]]}"
+    experiment = build(settings(f"view.front={front}", opaque, "display.planes=12"))
+    depths, light = torch.tensor(experiment.depths), experiment.light.sum((1, 2, 3))
+    assert list(experiment.depths) == sorted(experiment.depths)
+    assert float((depths * light).sum() / light.sum()) < 6e-3 - 0.5e-3

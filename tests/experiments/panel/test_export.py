@@ -116,6 +116,7 @@ def test_a_volume_is_encoded_and_its_loss_is_told(volume, tmp_path, encoding):
     words = ["shape=64", "pitch=3.74 um"]
     out, report = export_slm(volume, PANEL, tmp_path / "a", encoding=encoding, overrides=words)
     assert report["encoding"] == (encoding or "double_phase") and not report["padded"]
+    assert report["content"].startswith("phases that form the volume behind the panel")  # view.front=far
     hologram = np.load(volume / "arrays" / "hologram.npy")
     levels = [by_others(out / name) for name in report["files"]]
     phases = np.stack(levels) * (2 * math.pi / 256)

@@ -4,6 +4,7 @@ import pytest
 from paths import CONFIGS
 
 from holotorch.experiments.pec.plan import plan_values
+from holotorch.experiments.pec.report import pec_outcome
 from holotorch.experiments.registry import find_kind, load_config
 
 
@@ -42,3 +43,13 @@ def test_the_phase_per_kelvin_may_be_given_at_any_wavelength():
         limits.append(experiment.limit)
         assert experiment.array.response == pytest.approx([0.024])
     assert limits == pytest.approx([7.2] * 3)
+
+
+def test_a_poor_picture_at_its_limit_says_so():
+    def outcome(**corrected) -> str:
+        numbers = {"peak_temperature_rise_K": [300.0], "frames": 4} | corrected
+        return "\n".join(pec_outcome({"methods": {"corrected": numbers}}))
+
+    assert "at their limit" in outcome(ssim_mean=0.4, at_limit=True)
+    assert "limit" not in outcome(ssim_mean=0.4, at_limit=False) + outcome(ssim_mean=0.95, at_limit=True)
+    assert "silicon has melted" in outcome(peak_temperature_rise_K=[300.0, 1500.0])

@@ -435,7 +435,11 @@ def test_a_configuration_tracks_as_the_short_form_does(recording, capsys):
     config = str(CONFIGS / "track.yaml")
     words = [config, f"source={recording}", "video=false"]
     assert main(["check", *words]) == 0
-    assert capsys.readouterr().out.startswith("Source     recording: 960 x 540 px, 30 per second, 2 frames\n")
+    said = capsys.readouterr().out
+    assert said.startswith("Source     recording: 960 x 540 px, 30 per second, 2 frames\n")
+    assert "for synthetic recordings" not in said
+    assert main(["check", *words, "frames=10"]) == 0
+    assert "frames=10 is for synthetic recordings" in capsys.readouterr().out
     assert main(["run", *words, "--out", "a"]) == main(["track", str(recording), "--no-video", "--out", "b"]) == 0
     texts = [Path(name, "poses.csv").read_text().splitlines() for name in ("a", "b")]
     one, other = ([row | {"milliseconds": ""} for row in csv.DictReader(text)] for text in texts)
