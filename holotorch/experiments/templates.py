@@ -77,5 +77,5 @@ def _loosened(value: Any) -> Any:
 
 def _kind(name: str) -> ExperimentKind:
     if name not in KINDS:
-        raise ConfigError([f"no kind {name!r}{nearest(name, list(KINDS))}; known: {', '.join(KINDS)}"])
+        raise ConfigError([f"no kind {name!r}{nearest(name, list(KINDS))}"])
     return find_kind(name)
