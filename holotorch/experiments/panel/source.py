@@ -37,7 +37,7 @@ _AFTER_SPREADING = (
 )
 _FAR_END = (
     "phases that form the volume behind the panel, where the end that was rendered (view.front=far) is the hidden one: "
-    "its depth is inverted for an observer in front of the panel; view.front=near is right for him"
+    "its depth is inverted for an observer in front of the panel, for whom view.front=near is right"
 )
 
 
