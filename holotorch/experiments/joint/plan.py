@@ -11,7 +11,7 @@ from holotorch.experiments.joint.config import BASELINES, MOST_PLANES, JointSett
 from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.duration import duration
-from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise
+from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise, response_note
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.volume.plan import cut_off, dark_picture, preset_note, viewpoint
 from holotorch.optics.light.coherence import depth_of_focus
@@ -166,6 +166,7 @@ def _notes(experiment: JointExperiment) -> list[str]:
         notes.append(words)
     if (error := experiment.budget.error(SLABS)) > FEW_PLANES:
         notes.append(_few_planes(experiment, error))
+    notes += response_note(settings.display.model_fields_set, "display", settings.wavelengths)
     if settings.display.kernel is not None:
         notes += cut_off_note(experiment.crosstalk.kernel)
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)

@@ -39,15 +39,15 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
             "Note       the phases are at their limit: a higher one (display.max_temperature or max_phase), more "
             "frames or a narrower spread of the heat come closer"
         )
-    error, of, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), "", []
+    error, notes = summary.get("measured_error", summary.get("predicted_error", 0.0)), []
     if error > FEW_PLANES:
         shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
         notes.append(
             f"Warning    the planes are {error:.0%} off the volume: they show {shown}; more of them (display.planes) "
             "come closer"
         )
-        of = f", of pictures that are {error:.0%} off the volume"
-    return [*notes, f"Result     PSNR {'; '.join(scores)}{of}", *poor, *error_line(summary)]
+        scores[0] += f", of pictures that are {error:.0%} off the volume"
+    return [*notes, f"Result     PSNR {'; '.join(scores)}", *poor, *error_line(summary)]
 
 
 def joint_section(record: RunRecord) -> list[str]:

@@ -130,7 +130,7 @@ def heaters_text(report: dict[str, Any]) -> str:
         f"{report['heater_bits']} bits, so that few bits look black in a viewer); temperature_*: K above ambient, at "
         f"most {report['peak_temperature_K']:.0f}; optical_*: phases of the light in rad after spreading, not modulo "
         "2 pi. What fewer bits cost, holotorch view of the run shows (Levels of the heaters), and modulator.bits "
-        "computes a run for them. A liquid-crystal panel "
+        "of kind pec computes a run for them. A liquid-crystal panel "
         "needs holotorch export-slm instead" + warning
     )
 

@@ -13,7 +13,7 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import evaluations, padded_samples, seconds_of
 from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.duration import duration
-from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise
+from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise, response_note
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
@@ -297,7 +297,9 @@ def _notes(experiment: PECExperiment) -> list[str]:
     lost = experiment.array.crosstalk.lost_heat
     if lost > 0.01:
         notes.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
-    if experiment.settings.modulator.kernel is not None:
+    chip = experiment.settings.modulator
+    notes += response_note(chip.model_fields_set, "modulator", experiment.settings.wavelengths)
+    if chip.kernel is not None:
         notes += cut_off_note(experiment.array.crosstalk.kernel)
     if dark := [i for i, on in enumerate(experiment.lit.tolist()) if not on]:
         notes.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")

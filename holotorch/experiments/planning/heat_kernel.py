@@ -1,6 +1,7 @@
 """What a measured heat kernel tells of its own errors: its noise, and the heat beyond its table."""
 
 import math
+from collections.abc import Collection, Sequence
 
 import torch
 from torch import Tensor
@@ -39,6 +40,20 @@ def cut_off_note(kernel: Tensor) -> list[str]:
     return [
         f"the measured kernel is cut off where the rise is still {warm_ring(kernel):.1%} of that of its centre: the "
         "heat beyond is not in the model; give more rows and columns, or subtract what is not heat"
+    ]
+
+
+def response_note(given: Collection[str], section: str, wavelengths: Sequence[float]) -> list[str]:
+    """A note on a phase per kelvin whose wavelength is assumed to be 630 nm, which the run does not have.
+
+    ``given`` are the keys of the ``section`` that the configuration states.
+    """
+    if "rad_per_K" not in given or "rad_per_K_at" in given or any(abs(each - 630e-9) < 1e-9 for each in wavelengths):
+        return []
+    own = f"{wavelengths[0] * 1e9:.4g}nm"
+    return [
+        f"{section}.rad_per_K is taken to be that at 630 nm, which is none of the wavelengths here: say where it was "
+        f"measured, such as {section}.rad_per_K_at={own}, or limits and temperatures are those of another chip"
     ]
 
 

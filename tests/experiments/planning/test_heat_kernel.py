@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.experiments.planning.heat_kernel import continued, cut_off_note, is_cut_off
+from holotorch.experiments.planning.heat_kernel import continued, cut_off_note, is_cut_off, response_note
 
 
 def rises(height: int, width: int, length: float = 2.0) -> torch.Tensor:
@@ -35,3 +35,12 @@ def test_a_kernel_that_does_not_fall_is_not_continued():
 def test_a_table_that_ends_while_it_is_warm_is_noted(length, cut):
     kernel = rises(7, 7, length)
     assert is_cut_off(kernel) == cut == bool(cut_off_note(kernel))
+
+
+def test_a_phase_per_kelvin_without_its_wavelength_is_noted_where_there_is_no_light_of_630_nm():
+    (note,) = response_note({"rad_per_K"}, "display", [520e-9])
+    assert "display.rad_per_K_at=520nm" in note
+    assert response_note({"rad_per_K", "rad_per_K_at"}, "display", [520e-9]) == []
+    assert (
+        response_note({"rad_per_K"}, "modulator", [630e-9, 520e-9]) == response_note(set(), "modulator", [5e-7]) == []
+    )
