@@ -30,8 +30,12 @@ def wanted(kind: str, summary: dict) -> list[str]:
     if kind == "joint":
         methods = summary["methods"]
         stack, half = (methods["joint"][f"{name}_psnr"] for name in ("stack", "half"))
-        own = f"PSNR {stack:.1f} dB at the corrected foci; {half:.1f} dB through half pupils"
-        return [own, f": {max(methods[name]['stack_psnr'] for name in ('afterwards', 'slabs')):.1f} dB at"]
+        own = f"PSNR {stack:.1f} dB at the corrected foci, of pictures that are {summary['measured_error']:.0%} off the"
+        return [
+            own,
+            f" volume; {half:.1f} dB through half pupils",
+            f": {max(methods[name]['stack_psnr'] for name in ('afterwards', 'slabs')):.1f} dB at",
+        ]
     if kind == "study":
         return [f"study of limits: {summary['rows']} rows"]
     if kind == "measure":
