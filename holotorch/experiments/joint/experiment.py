@@ -163,8 +163,8 @@ class JointExperiment:
     def foci(self) -> list[float]:
         """Focal distances that are corrected, nearest first: the depths of the planes, or fewer of the same extent.
 
-        Where planes are closer than ``_APART`` depths of focus, their pictures hardly differ; foci that far apart take
-        less time and correct all of them as well (see ``scripts/docs/joint.md``).
+        Where planes are closer than ``_APART`` depths of focus, their pictures hardly differ; foci at that distance
+        take less time and correct all of them as well (see ``scripts/docs/joint.md``).
         """
         planes = sorted(self.depths)
         apart = _APART * depth_of_focus(min(self.settings.wavelengths), self.radius)

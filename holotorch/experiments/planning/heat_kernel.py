@@ -22,7 +22,7 @@ def outer_noise(kernel: Tensor) -> float:
 
 
 def warm_ring(kernel: Tensor) -> float:
-    """Largest mean rise along a side of a kernel [h, w], relative to its centre."""
+    """Largest mean rise along a side of a kernel [h, w], relative to its centre; 0 for a single tap."""
     middle = kernel[kernel.shape[0] // 2, kernel.shape[1] // 2]
     sides = [side.mean() for side in (kernel[0], kernel[-1], kernel[:, 0], kernel[:, -1]) if kernel.numel() > len(side)]
     return float(max(sides, default=0.0 * middle) / middle)
@@ -60,9 +60,10 @@ def response_note(given: Collection[str], section: str, wavelengths: Sequence[fl
 def continued(kernel: Tensor, shape: tuple[int, ...]) -> Tensor | None:
     """A measured kernel with the heat beyond its table, which falls on as it does towards the table's sides.
 
-    The rise beyond is exp(a - r / length), with r the distance from the centre in pixels and a and length fitted to the
-    two outermost rings; it goes on to a thousandth of the centre, or to ``shape``. A guess, which only tells how much
-    the missing heat may matter. None for a kernel that does not fall towards its sides.
+    ``kernel`` [h, w] has 1 at its centre; the result [H, W], float64, is at most as large as ``shape``, the pixels
+    (y, x) of the array. The rise beyond the table is exp(a - r / length), with r the distance from the centre in pixels
+    and a and length fitted to the two outermost rings; it goes on to a thousandth of the centre. A guess, which only
+    tells how much the missing heat may matter. None for a kernel that does not fall towards its sides.
     """
     kernel = kernel.detach().cpu().double()
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in kernel.shape)
@@ -73,8 +74,10 @@ def continued(kernel: Tensor, shape: tuple[int, ...]) -> Tensor | None:
     start, fall = torch.linalg.lstsq(fitted, kernel[rings].clamp(min=_LEAST).log()[:, None]).solution[:, 0].tolist()
     if not fall > 0:
         return None
-    reach = math.ceil((start - math.log(_FAINT)) / fall)
-    sides = [max(n, min(2 * reach + 1, 2 * ((most - 1) // 2) + 1)) for n, most in zip(kernel.shape, shape, strict=True)]
+    radius = math.ceil((start - math.log(_FAINT)) / fall)
+    sides = [
+        max(n, min(2 * radius + 1, 2 * ((most - 1) // 2) + 1)) for n, most in zip(kernel.shape, shape, strict=True)
+    ]
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in sides)
     whole = torch.exp(start - fall * torch.hypot(y[:, None], x))
     top, left = ((side - n) // 2 for side, n in zip(sides, kernel.shape, strict=True))
