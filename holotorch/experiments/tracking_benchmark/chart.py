@@ -28,8 +28,8 @@ class Amount(NamedTuple):
     poses: int = 4  # poses of the occlusions
     negatives: int = 1000  # frames without a catheter
     rounds: int = 15  # repetitions of each measurement of time
-    varied: int = 1104  # scenes of the second world with the catheter
-    lookalikes: int = 1160  # scenes of the second world without it
+    varied: int = 2064  # scenes of the second world with the catheter
+    lookalikes: int = 2000  # scenes of the second world without it
     placed: int = 4  # poses of the catheter in each photograph of a calibration board
     resting: tuple[tuple[str, tuple[int, int]], ...] | None = None  # points and poses of the catheters at rest; all
     stream: int = 6  # different frames of each kind whose times are measured

@@ -651,7 +651,7 @@ class CatheterTracker(nn.Module):
         path = math.hypot(axis.blur, box * ratio)  # determined even where width or blur alone is not
         combined = path / expected
         narrow = cold and path < _CHECK.narrow * math.hypot(min(axis.blur, edges.blur), box)
-        if min(axis.blur, edges.blur) > box or (cold and combined > max(ratio, 1.0)):
+        if min(axis.blur, edges.blur) > box or (cold and combined > ratio):
             ratio = combined
         if narrow or (abs(ratio - 1) > most and not moved):
             depth = float((line_pose.tip + sum(self._positions) / len(self._positions) * line_pose.direction)[2])

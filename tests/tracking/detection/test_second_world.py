@@ -47,6 +47,15 @@ def test_edges_that_colours_miss_are_measured_where_the_others_put_them(seed, co
     assert float((pose.tip - trial.tip).norm()) < 1e-3
 
 
+@pytest.mark.parametrize(("seed", "condition"), [(14, "gloss"), (24, "hue of band 1")])
+def test_a_fit_that_takes_width_for_blur_does_not_refuse_a_tube(seed, condition):
+    """Half as wide and twice as blurred: the second moment across the tube, which both share, is right."""
+    trial = WORLD.trial(seed, condition)
+    pose = tracked(trial)
+    assert pose.status is Status.OK, pose.reason
+    assert float((pose.tip - trial.tip).norm()) < 1e-3
+
+
 @pytest.mark.parametrize(
     ("seed", "kind"),
     [
