@@ -31,6 +31,7 @@ _MEANINGS = {
         "rad",
         "phase that each heater alone causes at its own pixel, before the heat spreads: what to drive it with",
     ),
+    "rise": ("K", "temperature above ambient that each heater alone causes at its own pixel, before the heat spreads"),
     "temperature": ("K", "temperature of each pixel above ambient, after the heat has spread"),
     "optical": ("rad", "phase of the light of each pixel, after the heat has spread, not modulo 2 pi"),
 }
@@ -54,11 +55,12 @@ class _Chip:
 
 
 def export_heaters(folder: Path, out: Path | None = None, *, bits: int = 16) -> tuple[Path, dict[str, Any]]:
-    """Write the heater phases, temperatures and optical phases of a run of kind ``pec`` or ``joint``.
+    """Write the heater phases and rises, temperatures and optical phases of a run of kind ``pec`` or ``joint``.
 
-    For each frame and colour and each of the three, a NumPy file (float32 [H, W]), a CSV file (a line for each row of
+    For each frame and colour and each of the four, a NumPy file (float32 [H, W]), a CSV file (a line for each row of
     pixels) and a 16-bit PNG; ``export.json`` gives the quantity and unit of each file, and the step of the PNG. The
-    PNG of the heaters holds drive levels of ``bits`` bits, evenly spaced from 0 to the largest phase of the run. Heat
+    PNG of the heaters holds drive levels of ``bits`` bits, evenly spaced from 0 to the largest phase of the run, and
+    ``*_levels.csv`` holds the same integers. Heat
     left from earlier frames is included if the run includes it; the values are then those at the end of each frame.
 
     Returns:
@@ -85,7 +87,12 @@ def _export(place: Path, chip: _Chip, bits: int) -> dict[str, Any]:
     """Write all files but export.json, whose content it returns."""
     phase, array = chip.phase, chip.array
     optical = chip.spread(phase)
-    maps = {"heater": phase, "temperature": array.temperature(optical), "optical": optical}
+    maps = {
+        "heater": phase,
+        "rise": array.temperature(phase),
+        "temperature": array.temperature(optical),
+        "optical": optical,
+    }
     steps = {name: values.max().item() / (2**16 - 1) for name, values in maps.items()}
     steps["heater"] = phase.max().item() / (2**bits - 1)
     driven = chip.spread((phase / (steps["heater"] or 1.0)).round() * steps["heater"])
@@ -98,8 +105,9 @@ def _export(place: Path, chip: _Chip, bits: int) -> dict[str, Any]:
             stem = f"{name}_frame{frame:02d}_colour{colour}_{wavelength * 1e9:.0f}nm"
             about = {"quantity": name, "unit": unit, "meaning": meaning, "frame": frame, "colour": colour}
             about["wavelength_m"] = wavelength
-            _write(place / stem, values[frame, colour], steps[name] or 1.0, about)
-            files.append({"files": [f"{stem}.npy", f"{stem}.csv", f"{stem}.png"], **about, "png_step": steps[name]})
+            names = [f"{stem}.npy", f"{stem}.csv", f"{stem}.png"] + [f"{stem}_levels.csv"] * (name == "heater")
+            _write([place / each for each in names], values[frame, colour], steps[name] or 1.0, about)
+            files.append({"files": names, **about, "png_step": steps[name]})
     return {
         "frames": phase.shape[0],
         "wavelengths_m": list(array.wavelengths),
@@ -127,21 +135,30 @@ def heaters_text(report: dict[str, Any]) -> str:
     return (
         f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s): heater_*: phases in rad that each "
         f"heater alone causes at its own pixel, before the heat spreads (a step of the PNG is {step:.4g} rad, "
-        f"{report['heater_bits']} bits, so that few bits look black in a viewer); temperature_*: K above ambient, at "
-        f"most {report['peak_temperature_K']:.0f}; optical_*: phases of the light in rad after spreading, not modulo "
+        f"{report['heater_bits']} bits, so that few bits look black in a viewer; *_levels.csv has the integers); "
+        "rise_*: the same as K above ambient, for a driver that takes temperatures; temperature_*: K above ambient "
+        f"after spreading, at most {report['peak_temperature_K']:.0f}; optical_*: phases of the light in rad after spreading, not modulo "
         "2 pi. What fewer bits cost, holotorch view of the run shows (Levels of the heaters), and modulator.bits "
         "of kind pec computes a run for them. A liquid-crystal panel "
         "needs holotorch export-slm instead" + warning
     )
 
 
-def _write(stem: Path, values: Tensor, step: float, about: dict[str, Any]) -> None:
-    save_array(stem.with_suffix(".npy"), values.float())
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([[f"{v:.6g}" for v in row] for row in values.tolist()])
-    write_text(stem.with_suffix(".csv"), text.getvalue())
+def _write(paths: list[Path], values: Tensor, step: float, about: dict[str, Any]) -> None:
+    """The values [H, W] as an array, a table and a picture of levels, and if there is a fourth path its levels."""
+    array, table, picture, *integers = paths
+    save_array(array, values.float())
+    write_text(table, _table([[f"{v:.6g}" for v in row] for row in values.tolist()]))
     levels = torch.from_numpy((values / step).round().clamp(0, 2**16 - 1).numpy().astype(np.uint16))
-    write_levels(stem.with_suffix(".png"), levels, about | {"step": step})
+    write_levels(picture, levels, about | {"step": step})
+    for path in integers:
+        write_text(path, _table(levels.tolist()))
+
+
+def _table(rows: list[list[Any]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def _load(folder: Path) -> _Chip:

@@ -151,7 +151,7 @@ def test_heater_files_say_what_they_are_and_agree(tmp_path, capsys):
     assert main(["export-heaters", str(run), "--bits", "8"]) == 0
     assert "before the heat spreads" in capsys.readouterr().out
     report, phase = json.loads((out / "export.json").read_text()), np.load(run / "arrays" / "phase.npy")
-    assert len(report["files"]) == 3 * 2 * 3 and report["frames"] == 2
+    assert len(report["files"]) == 4 * 2 * 3 and report["frames"] == 2
     assert report["peak_temperature_K"] == pytest.approx(max(rises), rel=1e-5)
     assert report["peak_temperature_K"] <= 300 * (1 + 1e-6)
     taps = torch.from_numpy(kernel(scale=1.0))[None, None]
@@ -160,7 +160,8 @@ def test_heater_files_say_what_they_are_and_agree(tmp_path, capsys):
         frame, colour = entry["frame"], report["wavelengths_m"].index(entry["wavelength_m"])
         heater = torch.from_numpy(phase[frame, colour]).double()
         optical = torch.nn.functional.conv2d(heater[None, None], taps, padding=2)[0, 0]
-        wanted = {"heater": heater, "optical": optical, "temperature": optical / response[colour]}[entry["quantity"]]
+        wanted = {"heater": heater, "rise": heater / response[colour], "optical": optical}
+        wanted = (wanted | {"temperature": optical / response[colour]})[entry["quantity"]]
         array = np.load(out / entry["files"][0])
         np.testing.assert_allclose(array, wanted, rtol=1e-5, atol=1e-5)
         with open(out / entry["files"][1], newline="") as stream:
@@ -169,7 +170,9 @@ def test_heater_files_say_what_they_are_and_agree(tmp_path, capsys):
         levels, about = read_levels(out / entry["files"][2])
         np.testing.assert_allclose(levels.numpy() * about["step"], array, atol=0.51 * about["step"] + 1e-5)
         assert (about["unit"], about["quantity"]) == (entry["unit"], entry["quantity"])
-        assert entry["quantity"] != "heater" or levels.int().max() <= 255
+        if entry["quantity"] == "heater":
+            integers = np.loadtxt(out / entry["files"][3], delimiter=",", dtype=int)
+            assert levels.int().max() <= 255 and np.array_equal(integers, levels.int().numpy())
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     for number in ("002", "003"):  # as folders of runs number themselves
         assert main(["export-heaters", str(run), "--bits", "8"]) == 0
@@ -225,7 +228,9 @@ def test_coarse_levels_above_the_limit_are_warned_of_and_files_of_near_colours_s
     assert main(["export-heaters", str(run)]) == 0 and "WARNING" not in capsys.readouterr().out
     report = json.loads((run / "heaters" / "export.json").read_text())
     names = [name for entry in report["files"] for name in entry["files"]]
-    assert len(names) == len(set(names)) == 3 * 3 * 3 and all((run / "heaters" / name).is_file() for name in names)
+    assert len(names) == len(set(names)) == 3 * (4 * 3 + 1) and all(
+        (run / "heaters" / name).is_file() for name in names
+    )
     coarse = tmp_path / "coarse"
     assert main(["export-heaters", str(run), "--bits", "1", "--out", str(coarse)]) == 0
     assert "WARNING: rounded to 1 bits" in capsys.readouterr().out
