@@ -13,7 +13,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.source import read_source
 from holotorch.experiments.registry import KINDS, find_kind, load_config
 from holotorch.experiments.report import outcome_lines, write_report
-from holotorch.experiments.runs.folder import RunFolder, open_run, tidied
+from holotorch.experiments.runs.folder import RunFolder, open_run, refuse_complete, tidied
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.processes import joined_processes
 from holotorch.experiments.runs.record import runs_inside
@@ -37,6 +37,7 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
             not fit into memory or cannot start.
     """
     kind = find_kind(settings.experiment)
+    refuse_complete(out)
     with _announced():
         experiment = kind.build(settings)
         plan = kind.plan(experiment)

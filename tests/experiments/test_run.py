@@ -239,10 +239,11 @@ def test_a_run_outside_the_main_thread_works(tmp_path):
         assert pool.submit(execute, settings(), tmp_path / "a").result()[1]
 
 
-def test_a_folder_is_never_overwritten(finished):
+def test_a_folder_is_never_overwritten(finished, capsys):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
     with pytest.raises(ConfigError, match="holds files already; choose another --out or delete it"):
         execute(settings(), finished)
+    assert not capsys.readouterr().out  # before the plan
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 
 

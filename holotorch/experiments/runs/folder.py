@@ -56,6 +56,12 @@ def claim(out: Path | None, name: str) -> Path:
     return out
 
 
+def refuse_complete(out: Path | None) -> None:
+    """ConfigError if ``out`` holds a complete run, before the inputs are read: a plan may take a minute."""
+    if out is not None and (out / "summary.json").exists():
+        raise ConfigError([f"{out} holds files already; choose another --out or delete it: its run is complete"])
+
+
 @dataclass
 class RunFolder:
     """The folder of a running experiment."""

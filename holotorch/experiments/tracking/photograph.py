@@ -65,6 +65,9 @@ def calibrate_catheter(
     overrides = [f"{key}={value}" for key, value in measured.items()]
     if "edges" in measured:  # there may be more bands than in the file, whose colours are replaced below
         bands = measured["edges"].count(",")
+        if bands != len(places):
+            needed = f"{len(places)} bands have {len(places) + 1} edges: where each begins, and where the last one ends"
+            raise ConfigError([f"--edges: {needed}; got {bands + 1}: {measured['edges'][1:-1]}"])
         overrides.append(f"colours={[list(_STAND_INS[i % 2]) for i in range(bands)]}")
     tool = build_catheter(load_catheter(find_config(source) or source, overrides))
     pixels = _pixels(photograph)
