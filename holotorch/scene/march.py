@@ -1,5 +1,6 @@
 """Ray marching: front-to-back compositing of a volume along all rays, one slab of the volume per plane of sources."""
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,11 +20,11 @@ from holotorch.scene.volume import Volume
 
 @dataclass(frozen=True)
 class Step:
-    """Contribution of a plane to n rays; the radiance is weight times colour."""
+    """Contribution of a sample within a slab to n rays; the radiance is weight times colour."""
 
     plane: int  # index of the plane, from front to back
     rays: Tensor  # flat indices of the rays into the rows and columns of the window, [n]
-    weight: Tensor  # transmittance up to the slab times opacity of the slab, [n]
+    weight: Tensor  # transmittance up to the part of the slab times opacity of this part, [n]
     colour: Tensor  # of each channel, such as red, green, blue, [C, n]
 
 
@@ -48,6 +49,7 @@ class March:
     spans: Sequence[tuple[float, float]]  # smallest and largest depth in metres of the slab of each plane
     observer: float  # -1 if the observer is on the side of smaller depths, else 1
     early: float  # transmittance below which a ray ends
+    samples: int = 1  # equal parts of each slab, within the volume, of which each is one sample of a ray
 
     def __post_init__(self) -> None:
         volume, place, transfer, rays = self.volume, self.place, self.transfer, self.rays
@@ -67,13 +69,21 @@ class March:
 
     @property
     def thickest(self) -> float:
-        """Thickness of the thickest slab within the volume, in the smallest distance between voxels."""
+        """Thickness of the thickest part of a slab that is one sample, in the smallest distance between voxels."""
+        thickness = max((high - low for span in self.spans for low, high in self.parts(*span)), default=0.0)
+        return thickness / min(self.place.spacing)
+
+    def parts(self, low: float, high: float) -> list[tuple[float, float]]:
+        """Smallest and largest depths of the parts of a slab, front to back; none for a slab beside the volume."""
         near, far = self.place.depth_range()
-        thickness = max(min(high, far) - max(low, near) for low, high in self.spans)
-        return max(0.0, thickness) / min(self.place.spacing)
+        low, high = max(low, near), min(high, far)
+        if low >= high:
+            return []
+        ends = [low + (high - low) * i / self.samples for i in range(self.samples)] + [high]
+        return list(itertools.pairwise(ends))[:: -1 if self.observer > 0 else 1]
 
     def steps(self, selected: Tensor | None = None) -> Iterator[Step]:
-        """Yield the contributions of the planes, front to back; planes without a contribution are left out.
+        """Yield the contributions to the planes, front to back; planes without a contribution are left out.
 
         ``selected``, bool [h, w], selects the rays to compute; None means all.
         """
@@ -82,17 +92,15 @@ class March:
         reader, place = self._reader(), self.place
         unit = self.transfer.unit_distance * max(place.half) * 2  # in metres
         rotation = torch.tensor(place.rotation, dtype=torch.float64, device=self.device)
-        near, far = place.depth_range()
         transmittance = self.zeros(1)[0] + 1
         if selected is not None:
             rows, columns = self.window.rows, self.window.columns
             transmittance = transmittance * selected[rows.start : rows.stop, columns.start : columns.stop].flatten()
-        for plane, (low, high) in enumerate(self.spans):
+        for plane, (low, high) in ((i, part) for i, span in enumerate(self.spans) for part in self.parts(*span)):
             alive = transmittance.detach() > self.early
             if self.known and not alive.any():
                 return
-            low, high = max(low, near) - place.distance, min(high, far) - place.distance
-            sampled = reader.read(low, high, alive) if low < high else None
+            sampled = reader.read(low - place.distance, high - place.distance, alive)
             if sampled is None:
                 continue
             colour, opacity = self.transfer(sampled.samples[0])
@@ -121,17 +129,19 @@ class March:
         # One zero, expanded to the shape of a plane without allocating it.
         dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(self.channels, *self.rays.grid.shape)
         done = 0
-        for step in self.steps(selected):
-            yield from [dark] * (step.plane - done)
-            done = step.plane + 1
-            scale, radiance = self.rays.scale(self.depths[step.plane]), step.weight * step.colour
-            window = self.zeros(self.channels)
+        for plane, steps in itertools.groupby(self.steps(selected), lambda step: step.plane):
+            yield from [dark] * (plane - done)
+            done = plane + 1
+            scale, window, step = self.rays.scale(self.depths[plane]), self.zeros(self.channels), next(steps)
+            if self.samples == 1 and fill is None and scale == 1:  # the root of the few rays that contribute
+                yield self.whole(window.index_copy_(1, step.rays, safe_sqrt(step.weight * step.colour)))
+                continue
+            for each in itertools.chain([step], steps):
+                window.index_add_(1, each.rays, each.weight * each.colour)
             if fill is not None:
-                yield safe_sqrt(fill(self.whole(window.index_copy_(1, step.rays, radiance))))
-            elif scale == 1:
-                yield self.whole(window.index_copy_(1, step.rays, safe_sqrt(radiance)))
+                yield safe_sqrt(fill(self.whole(window)))
             else:
-                yield safe_sqrt(self._resampled(window.index_copy_(1, step.rays, radiance), scale))
+                yield safe_sqrt(self.whole(window) if scale == 1 else self._resampled(window, scale))
         yield from [dark] * (len(self.depths) - done)
 
     def zeros(self, channels: int) -> Tensor:

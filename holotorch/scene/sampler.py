@@ -34,10 +34,12 @@ class DVRSampler(nn.Module):
 
     Each plane represents a slab of the volume. On plane j a ray gives a source of radiance C_j = T_j alpha_j c_j
     (Eq. 5.6), with the transmittance T_j up to the slab, and opacity alpha_j and colour c_j of the slab. Its amplitude
-    is the square root of C_j. Colour and opacity are those of the value half-way through the slab; the opacity is
-    corrected for the path length within slab and volume. For a homogeneous medium the total opacity is therefore exact
-    for any choice of planes; otherwise the error is proportional to the square of the slab thickness, and
-    :meth:`slab_error` predicts it.
+    is the square root of C_j. Colour and opacity are those of the value half-way through the slab, as in the thesis, or
+    of several ``samples`` within it, which are composited; the opacity is corrected for the path length within slab and
+    volume. For a homogeneous medium the total opacity is therefore exact for any choice of planes; otherwise the error
+    of the rendering is proportional to the square of the slab thickness per sample, and :meth:`slab_error` predicts it.
+    More samples cost rendering time alone, more planes also that of the hologram; planes are needed for the depth of
+    the light, at most a depth of focus apart.
 
     Slabs meet half-way between planes. The outermost slabs are symmetric about their plane; a single plane represents
     the whole volume. Space outside the volume is transparent.
@@ -51,8 +53,8 @@ class DVRSampler(nn.Module):
     the largest error that this causes in a picture.
 
     Attributes:
-        checks_slabs: Whether the next call predicts the error of slabs more than four voxels thick, which takes 0.1 to
-            1 s, and warns of a large one. False after the first call.
+        checks_slabs: Whether the next call predicts the error of slabs more than four voxels thick per sample, which
+            takes 0.1 to 1 s, and warns of a large one. False after the first call.
 
     Args:
         transfer: Colour and opacity as functions of the value of the volume.
@@ -72,6 +74,7 @@ class DVRSampler(nn.Module):
             ``holotorch.scene.phases``. None for a phase of 0.
         early: Transmittance below which a ray ends, in [0, 1).
         boundaries: Boundaries of the slabs in metres, [D + 1], if they are not half-way between the planes.
+        samples: Samples of the volume within each slab, in the middles of equal parts of it.
 
     Raises:
         TypeError: An argument of a wrong type.
@@ -79,7 +82,8 @@ class DVRSampler(nn.Module):
 
     Warns:
         SamplingWarning: In a call without ``boundaries``, if the slabs leave out a visible part of the volume. In the
-            first call, if slabs are more than four voxels thick and the rendering is a quarter off because of it.
+            first call, if slabs are more than four voxels thick per sample and the rendering is a quarter off because
+            of it.
     """
 
     def __init__(
@@ -96,6 +100,7 @@ class DVRSampler(nn.Module):
         phase: Callable[[Grid], PhaseMaps] | None = None,
         early: float = 1e-3,
         boundaries: Sequence[float] | None = None,
+        samples: int = 1,
     ):
         super().__init__()
         self.transfer, self.grid, self.lighting, self.phase = transfer, rays, lighting, phase
@@ -108,6 +113,7 @@ class DVRSampler(nn.Module):
         if not 0 <= checks.finite("early", early) < 1:
             raise ValueError(f"early must be a transmittance in [0, 1), 0 to follow all rays, got {early}")
         self.early = float(early)
+        self.samples = checks.whole("samples", samples, 1)
         self.checks_slabs = True
 
     def forward(
@@ -164,11 +170,11 @@ class DVRSampler(nn.Module):
         return SlabLayers(self.grid, self.depths, torch.stack(emission), torch.stack(opacity))
 
     def slab_error(self, volume: Volume) -> float:
-        """Predicted relative L2 error of :meth:`render`, without lighting, because the slabs are not infinitely thin.
+        """Predicted relative L2 error of :meth:`render`, without lighting, because samples are not infinitely close.
 
-        It is the change of some hundred rays spread over the grid when every slab is divided into parts of half a
-        voxel; of more than a thousand slabs, neighbours are joined first, and the error falls with the square of their
-        number. 0 for a volume without visible parts.
+        It is the change of some hundred rays spread over the grid when the part of a slab that each sample represents
+        is divided into parts of half a voxel; of more than a thousand, neighbours are joined first, and the error falls
+        with the square of their number. 0 for a volume without visible parts.
         """
         shape = tuple(
             min(n, max(_FEW_RAYS, math.ceil(extent / _FARTHEST)))
@@ -176,19 +182,14 @@ class DVRSampler(nn.Module):
         )
         pitch = tuple(step * n / few for step, n, few in zip(self.grid.pitch, self.grid.shape, shape, strict=True))
         coarse = replace(self._placed(volume, Grid((shape[0], shape[1]), (pitch[0], pitch[1]))), lighting=None)
-        near, far = coarse.place.depth_range()
-        joined = math.ceil(2 * len(coarse.spans) / _MOST_SLABS)
-        if joined > 1:
-            groups = [coarse.spans[k : k + joined] for k in range(0, len(coarse.spans), joined)]
-            spans = [(min(low for low, _ in group), max(high for _, high in group)) for group in groups]
-            coarse = replace(coarse, spans=spans, depths=list(coarse.depths)[::joined])
-        spans = [(max(low, near), min(high, far)) for low, high in coarse.spans]
-        parts = max(2, min(math.ceil(2 * coarse.thickest), _MOST_SLABS // len(spans)))
-        order = range(parts) if coarse.observer < 0 else range(parts - 1, -1, -1)  # front to back within a slab
-        divided = [(a + (b - a) * i / parts, a + (b - a) * (i + 1) / parts) for a, b in spans for i in order]
-        depths = [depth for depth in coarse.depths for _ in order]
+        spans = [part for span in coarse.spans for part in coarse.parts(*span)]
+        joined = max(1, math.ceil(2 * len(spans) / _MOST_SLABS))
+        groups = [spans[k : k + joined] for k in range(0, len(spans), joined)]
+        spans = [(min(low for low, _ in group), max(high for _, high in group)) for group in groups]
+        coarse = replace(coarse, spans=spans, samples=1)
+        parts = max(2, min(math.ceil(2 * coarse.thickest), _MOST_SLABS // max(1, len(spans))))
         with torch.no_grad():
-            thick, thin = coarse.picture()[0], replace(coarse, spans=divided, depths=depths).picture()[0]
+            thick, thin = coarse.picture()[0], replace(coarse, samples=parts).picture()[0]
         norm = thin.norm().item()
         error = (thick - thin).norm().item() / norm if norm else 0.0
         return error * parts**2 / (parts**2 - 1) / joined**2
@@ -210,7 +211,8 @@ class DVRSampler(nn.Module):
             if (error := self.slab_error(volume)) > _COARSE:
                 warnings.warn(
                     f"slabs are up to {march.thickest:.0f} voxels thick for a scene that varies within them: the "
-                    f"rendering is about {error:.0%} off the one with thin slabs; use more planes (see slab_error)",
+                    f"rendering is about {error:.0%} off the one with thin slabs; use more samples, or planes (see "
+                    "slab_error)",
                     checks.SamplingWarning,
                     stacklevel=3,
                 )
@@ -230,7 +232,8 @@ class DVRSampler(nn.Module):
             where = f"beyond {far:g} m" if falling else f"before {near:g} m"
             raise ValueError(f"eye must be in front of all slabs, {where} for these depths, got {eye:g} m")
         rays, observer = Rays(grid, first, eye), 1.0 if falling else -1.0
-        return March(volume, place, self.transfer, self.lighting, rays, self.depths, spans, observer, self.early)
+        geometry = place, self.transfer, self.lighting, rays, self.depths, spans, observer
+        return March(volume, *geometry, self.early, self.samples)
 
     def _warn_of_lost_depth(self, march: March) -> None:
         if self.boundaries is not None or march.visible is None:

@@ -313,6 +313,56 @@ def test_the_error_of_thick_slabs_is_predicted_and_warned_of(planes, front):
     assert error > 1e-3
 
 
+@pytest.mark.parametrize("geometry", GEOMETRIES)
+@pytest.mark.parametrize("order", [1, -1], ids=["rising", "falling"])
+def test_samples_within_a_slab_are_those_of_as_many_thinner_slabs(geometry, order):
+    """Every thin slab as its own sample: the slow twin. Their light together is that of the plane."""
+    options, volume, count = dict(GEOMETRIES[geometry]) | {"distance": CENTRE}, noise(20, 20, 20), 5
+    if "eye" in options and order < 0:
+        options["eye"] = 0.05
+    half = 0.5 * WIDTH * (1.4 if "rotation" in options else 1.0)  # of the box around the volume
+    thin = torch.linspace(CENTRE - half * order, CENTRE + half * order, 4 * count + 1, dtype=torch.float64)
+    first = ((thin[0] + thin[1]) / 2).item()  # rays from an eye pass through the points of the grid on this plane
+
+    def cut(ends: torch.Tensor, samples: int) -> DVRSampler:
+        depths = [first, *((ends[1:] + ends[:-1]) / 2).tolist()[1:]]
+        return sampler(depths=depths, **options | {"boundaries": ends.tolist(), "samples": samples})
+
+    values = volume.values.requires_grad_()
+    both = one, other = cut(thin[::count], count), cut(thin, 1)
+    pictures = [each.render(volume) for each in both]
+    torch.testing.assert_close(*pictures, rtol=1e-10, atol=1e-12)
+    gradients = [torch.autograd.grad(picture.square().sum(), values)[0] for picture, _ in pictures]
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-11)
+    if "eye" in options:
+        return  # the light of each plane is interpolated onto its grid
+    with torch.no_grad():
+        planes, parts = (torch.stack(list(each(volume).amplitudes())).square() for each in both)
+        torch.testing.assert_close(planes, parts.unflatten(0, (-1, count)).sum(1), rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(one.slab_layers(volume).towards((0.0, 0.0)), planes, rtol=1e-8, atol=1e-10)
+
+
+def test_samples_bring_the_rendering_of_few_planes_near_that_of_many(recwarn):
+    """The error falls with the square of their number, as it is predicted to, and the warning goes."""
+    z = torch.linspace(0, 6, 96, dtype=torch.float64)
+    volume = Volume((0.5 + 0.4 * z.sin())[:, None, None].expand(96, 4, 4).contiguous(), (1.0, 24.0, 24.0), "relative")
+    geometry = {"rays": Grid(4, 1e-4), "distance": CENTRE, "depths": [0.0197, 0.0203]}
+    wanted = sampler(**geometry, samples=400).render(volume)[0]
+    errors = []
+    for count in (1, 4, 16):
+        one = sampler(**geometry, samples=count)
+        errors.append(((one.render(volume)[0] - wanted).norm() / wanted.norm()).item())
+        assert one.slab_error(volume) == pytest.approx(errors[-1], rel=0.2)
+    assert errors[0] > 10 * errors[1] and errors[1] == pytest.approx(16 * errors[2], rel=0.3)
+    assert len(recwarn) == (errors[0] > 0.25)
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, "2"])
+def test_a_number_of_samples_that_is_none(count):
+    with pytest.raises((TypeError, ValueError), match="samples"):
+        sampler(samples=count)
+
+
 def test_the_error_of_very_many_slabs_follows_from_that_of_fewer():
     values = torch.linspace(0, math.pi, 64, dtype=torch.float64).sin() ** 2
     volume = Volume(values[:, None, None].expand(64, 4, 4).contiguous(), (1.0, 16.0, 16.0), "relative")

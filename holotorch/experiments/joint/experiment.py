@@ -100,14 +100,9 @@ class JointExperiment:
         return depth / (abs(planes[-1] - planes[0]) * len(planes) / (len(planes) - 1))
 
     @cached_property
-    def slab_error(self) -> float:
-        """Predicted relative L2 error of the rendering by so few planes."""
-        return self.scene.sampler().slab_error(self.scene.volume)
-
-    @cached_property
     def budget(self) -> Budget:
         """Tolerances and predicted errors of heat kernel, planes, propagation and stopping rule."""
-        return shares.joint_budget(self.settings, self.slab_error, self.padded)
+        return shares.joint_budget(self.settings, self.scene.slab_error, self.padded)
 
     def padded(self, factor: int) -> Grid:
         """Padded grid of a view for light that travels up to ``factor`` times as far as to the farthest focus."""
@@ -395,7 +390,7 @@ def build(settings: JointSettings) -> JointExperiment:
     scene = build_volume(VolumeSettings.model_validate(volume_settings(settings)))
 
     def slab_error(count: int) -> float:
-        return with_planes(scene, settings, count).sampler().slab_error(scene.volume)
+        return with_planes(scene, settings, count).single_error
 
     experiment = JointExperiment(settings, with_planes(scene, settings, shares.choose_planes(settings, slab_error)))
     _ = experiment.crosstalk  # read now, so that its errors are reported

@@ -10,7 +10,7 @@ from torch import Tensor
 from holotorch.core.complex import phasor
 from holotorch.correction import Solution
 from holotorch.experiments.joint.budget import PATIENCE, SLABS
-from holotorch.experiments.joint.experiment import JointExperiment, with_planes
+from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.methods import Shown, show
 from holotorch.experiments.joint.seconds import shown_seconds, step_seconds
 from holotorch.experiments.planning.correction import HEAT, PROPAGATION, STOPPING, scaled_error, spread_completely
@@ -22,7 +22,7 @@ from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import PupilViews
 
 _FINER = 2  # factor on the padded samples of a view along each axis, in the reference of the propagation
-_THINNER = 4  # factor on the number of planes in the reference of the rendering
+_THINNER = 4  # factor on the number of samples in the reference of the rendering
 
 Measure = Callable[[JointExperiment, Solution], tuple[float | None, str]]
 
@@ -79,12 +79,13 @@ def _propagation(experiment: JointExperiment, solution: Solution) -> tuple[float
 
 def _planes(experiment: JointExperiment, _: Solution) -> tuple[float, str]:
     """Error of the rendering along the axis."""
-    scene, count = experiment.scene, _THINNER * len(experiment.depths)
-    thin = with_planes(scene, experiment.settings, count)
+    scene = experiment.scene
+    numbers = scene.samples, _THINNER * scene.samples
     with torch.no_grad():
-        pictures: list[Tensor] = [each.sampler().render(scene.volume)[0] for each in (scene, thin)]
+        pictures: list[Tensor] = [scene.sampler(samples=n).render(scene.volume)[0] for n in numbers]
     error = relative_error(*pictures) / math.sqrt(1 - _THINNER**-2)
-    return error, f"the rendering by {len(experiment.depths)} planes against {count}"
+    of, against = (n * len(experiment.depths) for n in numbers)
+    return error, f"the rendering by {of} samples along each ray against {against}"
 
 
 def _stopping(experiment: JointExperiment, solution: Solution) -> tuple[float | None, str]:

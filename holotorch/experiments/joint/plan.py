@@ -79,7 +79,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {experiment.scene.width * 1e3:.3g} mm "
         f"wide, on {len(values['planes_mm'])} planes from "
         f"{values['planes_mm'][0]:.4g} to {values['planes_mm'][-1]:.4g} mm behind the array, its "
-        f"front nearest{stretched}",
+        f"front nearest{stretched}, {experiment.scene.samples} sample(s) of the volume for each",
         f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "
@@ -124,39 +124,25 @@ def _left(settings: JointSettings) -> float:
     return math.exp(-settings.heat.frame_us / settings.heat.time_constant_us)
 
 
-def _more_planes(experiment: JointExperiment) -> tuple[int, float]:
-    """The least of 2, 4 and 8 times as many planes that are close enough to the volume, else 8 times, and its error.
-
-    Never more than ``MOST_PLANES``.
-    """
-    count, error = len(experiment.depths), math.inf
-    for factor in (2, 4, 8):
-        if error > FEW_PLANES and count < MOST_PLANES:
-            count = min(MOST_PLANES, factor * len(experiment.depths))
-            more = with_planes(experiment.scene, experiment.settings, count)
-            error = more.sampler().slab_error(more.volume)
-    return count, error
-
-
-def _few_planes(experiment: JointExperiment, error: float) -> str:
-    """A note on planes that are ``error`` off the volume, and on what is closer."""
+def _far_apart(experiment: JointExperiment, step: float, focus: float) -> str:
+    """A note on planes ``step`` apart, for an eye with a depth of focus of ``focus``, both in metres."""
     settings, count = experiment.settings, len(experiment.depths)
-    shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
-    words = f"{count} planes are {error:.0%} off this volume: the array forms their pictures, which show {shown}; "
-    if count >= MOST_PLANES:
-        return words + "more of them are not accepted: thicker or softer parts (transfer), or a part of the volume"
-    more, left = _more_planes(experiment)
+    words = (
+        f"the planes are {step * 1e3:.3g} mm apart, more than {_SPACING:g} of the depth of focus of "
+        f"{focus * 1e3:.3g} mm: images between them may be worse, and the light of a slab is where its plane is; "
+    )
+    more = min(MOST_PLANES, math.ceil(count * step / (_SPACING * focus)))
+    if more <= count:
+        return words + "use a smaller pupil or display.depth"
     # Where it is asked for by name, the comparison "slabs" needs a frame for each plane.
     names = settings.report.baselines
     frames = f" frames={more}" if "slabs" in names and names != BASELINES else ""
-    still = ", still too much: this array shows this volume in slices only" if left > COARSE_PLANES else ""
     now, then = (
         sum(seconds_of(each, machine_speed(experiment.device)).values())
         for each in (experiment, replace(experiment, scene=with_planes(experiment.scene, settings, more)))
     )
-    return (
-        f"{words}display.planes={more}{frames} would be {left:.0%} off, in about {then / now:.2g} times the time{still}"
-    )
+    ratio = f"in about {then / now:.2g} times the time"
+    return f"{words}display.planes={more}{frames} puts it where it belongs, {ratio}, or use a smaller pupil"
 
 
 def _notes(experiment: JointExperiment) -> list[str]:
@@ -165,16 +151,17 @@ def _notes(experiment: JointExperiment) -> list[str]:
     if words := preset_note(experiment.scene):
         notes.append(words)
     if (error := experiment.budget.error(SLABS)) > FEW_PLANES:
-        notes.append(_few_planes(experiment, error))
+        shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
+        notes.append(
+            f"the rendering is {error:.0%} off this volume: pictures show {shown}; without view.samples, slabs are "
+            "sampled as often as needed"
+        )
     notes += response_note(settings.display.model_fields_set, "display", settings.wavelengths)
     if settings.display.kernel is not None:
         notes += cut_off_note(experiment.crosstalk.kernel)
     focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
     if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:
-        notes.append(
-            f"the planes are {step * 1e3:.3g} mm apart, more than {_SPACING:g} of the depth of focus of "
-            f"{focus * 1e3:.3g} mm: images between them may be worse; use more planes or a smaller pupil"
-        )
+        notes.append(_far_apart(experiment, step, focus))
     if 0 < (deep := foci[-1] - foci[0]) < focus:
         notes.append(
             f"the planes lie within {deep * 1e3:.3g} mm, less than the depth of focus of {focus * 1e3:.3g} mm: every "

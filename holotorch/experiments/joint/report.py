@@ -43,8 +43,8 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
     if error > FEW_PLANES:
         shown = "slices of it" if error > COARSE_PLANES else "thin parts of it broken"
         notes.append(
-            f"Warning    the planes are {error:.0%} off the volume: they show {shown}; more of them (display.planes) "
-            "come closer"
+            f"Warning    the rendering is {error:.0%} off the volume: pictures show {shown}; more planes, or slabs "
+            "sampled as often as needed (without view.samples), come closer"
         )
         scores[0] += f", of pictures that are {error:.0%} off the volume"
     return [*notes, f"Result     PSNR {'; '.join(scores)}", *poor, *error_line(summary)]

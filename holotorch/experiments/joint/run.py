@@ -75,7 +75,7 @@ def _fingerprint(experiment: JointExperiment) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
     _, inputs, _ = fingerprint_inputs(experiment.scene)
     settings = experiment.settings
-    free = {"device", "steps"}
+    free = {"device", "steps", "view.samples"}  # the number of samples is among the inputs
     if settings.eye.per_step is None:
         free.add("eye.per_step")  # checkpoints of before there was one do not have it
     else:

@@ -137,8 +137,9 @@ def heaters_text(report: dict[str, Any]) -> str:
         f"heater alone causes at its own pixel, before the heat spreads (a step of the PNG is {step:.4g} rad, "
         f"{report['heater_bits']} bits, so that few bits look black in a viewer; *_levels.csv has the integers); "
         "rise_*: the same as K above ambient, for a driver that takes temperatures; temperature_*: K above ambient "
-        f"after spreading, at most {report['peak_temperature_K']:.0f}; optical_*: phases of the light in rad after spreading, not modulo "
-        "2 pi. What fewer bits cost, holotorch view of the run shows (Levels of the heaters), and modulator.bits "
+        f"after spreading, at most {report['peak_temperature_K']:.0f}; optical_*: phases of the light in rad after "
+        "spreading, not modulo 2 pi. What fewer bits cost, holotorch view of the run shows (Levels of the heaters), "
+        "and modulator.bits "
         "of kind pec computes a run for them. A liquid-crystal panel "
         "needs holotorch export-slm instead" + warning
     )

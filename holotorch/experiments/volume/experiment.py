@@ -38,6 +38,7 @@ _COUNTED = 1_000_000  # largest number of voxels in the histogram
 HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the tolerance of a run
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
+_CLOSE = 0.05  # predicted error of the rendering above which slabs are sampled more than once
 _QUICK_PLANES = 1000  # planes of a quick rendering at most; as many slabs as voxels along the depth are thin enough
 
 # Arguments in the messages of ``load_volume``, and the settings that stand for them; those named in full come first.
@@ -190,8 +191,32 @@ class VolumeExperiment:
         low, high = float(threshold_otsu(values)), float(np.quantile(values, 0.999))
         return (low, high) if low < high else (low, float(values.max()))
 
-    def sampler(self, seed: int = 0) -> DVRSampler:
-        """The renderer with the random phases of a realisation."""
+    @cached_property
+    def samples(self) -> int:
+        """Samples of the volume along a ray within each slab."""
+        given = self.settings.view.samples
+        if given is not None or self.single_error <= _CLOSE:
+            return given or 1
+        # The error falls with their square, once they are close enough; two for each voxel are.
+        finest = 2 * max(self.volume.shape) // len(self.depths) + 1
+        few = min(finest, math.ceil(math.sqrt(self.single_error / _CLOSE)))
+        return few if few == finest or self._slab_error(few) <= _CLOSE else finest
+
+    @cached_property
+    def single_error(self) -> float:
+        """Predicted relative L2 error of the rendering with one sample for each slab."""
+        return self._slab_error(1)
+
+    @cached_property
+    def slab_error(self) -> float:
+        """Predicted relative L2 error of the rendering."""
+        return self.single_error if self.samples == 1 else self._slab_error(self.samples)
+
+    def _slab_error(self, samples: int) -> float:
+        return self.sampler(samples=samples).slab_error(self.volume)
+
+    def sampler(self, seed: int = 0, samples: int | None = None) -> DVRSampler:
+        """The renderer with the random phases of a realisation; ``samples`` in place of those of the run."""
         generator = torch.Generator().manual_seed(self.settings.seed + seed)
         phases: dict[str, Callable[[Grid], Tensor | PointPhases] | None] = {
             "ray": lambda grid: random_phase(grid, generator=generator),
@@ -208,6 +233,7 @@ class VolumeExperiment:
             rotation=self.rotation,
             lighting=self._lighting(),
             phase=phases[self.settings.phase],
+            samples=samples or self.samples,
         )
         sampler.checks_slabs = False  # the plan states the error
         return sampler
@@ -234,6 +260,7 @@ class VolumeExperiment:
             distance=self.distance,
             rotation=self.rotation,
             lighting=self._lighting() if lit else None,
+            samples=self.samples,
         )
         sampler.checks_slabs = False  # the plan states the error
         with torch.no_grad():

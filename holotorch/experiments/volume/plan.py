@@ -19,7 +19,7 @@ from holotorch.scene import DVRSampler
 
 # Times on one core of the reference machine of ``planning.machine``.
 FLOP_SECONDS = 5.7e-11  # seconds per operation of a HologramPlan
-_RAY_SECONDS = 2.5e-8  # seconds of rendering per ray and plane
+_RAY_SECONDS = 2.5e-8  # seconds of rendering per ray and sample
 _FIELD_SECONDS = 1e-8  # seconds / (n log2 n) to refocus a field of n samples
 _CALL_SECONDS = 0.015  # seconds to plan the refocusing of a field
 _PICTURE_SECONDS = 2.4e-6  # seconds to score a pixel of a picture, encode it and draw it in a figure
@@ -40,7 +40,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
     machine = machine_speed(experiment.device)
     seconds = {"holograms": settings.report.seeds * hologram_seconds(experiment, machine)}
     seconds |= _evaluation_seconds(experiment, machine)
-    slab_error = experiment.sampler().slab_error(experiment.volume)
+    slab_error = experiment.slab_error
     spectra = [experiment.dtype.itemsize * math.prod(plan.size) for plan in plans]  # bytes
     # While planes are added, each colour holds a sum and a summand; at the end, one spectrum is transformed as well.
     slab = 8 * rays * _SLAB * len(plans)
@@ -54,6 +54,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
             "width_mm": experiment.width * 1e3,
         },
         "planes": len(depths),
+        "samples": experiment.samples,
         "slab_error": round(slab_error, 4),
         "depths_mm": [min(depths) * 1e3, max(depths) * 1e3],
         "rays": list(experiment.rays.shape),
@@ -91,7 +92,8 @@ def hologram_seconds(experiment: VolumeExperiment, machine: Machine) -> float:
 
 def rendering_seconds(experiment: VolumeExperiment, machine: Machine) -> float:
     """Seconds to render the volume once."""
-    return _RAY_SECONDS * math.prod(experiment.rays.shape) * len(experiment.depths) * machine.elementwise
+    steps = len(experiment.depths) * experiment.samples
+    return _RAY_SECONDS * math.prod(experiment.rays.shape) * steps * machine.elementwise
 
 
 def _evaluation_seconds(experiment: VolumeExperiment, machine: Machine) -> dict[str, float]:
@@ -138,8 +140,8 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide",
         f"View       {viewpoint(experiment)}",
         f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
-        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end first; predicted error of the "
-        f"rendering by slabs this thick: {100 * values['slab_error']:.2g} %",
+        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end first, {values['samples']} sample(s) "
+        f"of the volume for each; predicted error of the rendering: {100 * values['slab_error']:.2g} %",
         f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um; field of view "
         f"{', '.join(f'{angle:.2f}' for angle in physics['field_of_view_deg'])} deg",
     ]
@@ -205,10 +207,9 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
         # Pictures hardly depend on it, and nobody asked for a field of a certain accuracy.
         notes = [note for note in notes if note != EDGE_MATTERS]
     if slab_error > _COARSE_SLABS:
-        twice = 2 * len(experiment.depths) * experiment.settings.scale
         notes.append(
-            f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: more planes, such as "
-            f"hologram.depths={twice} for about half of that, come closer, at little cost with axial nodes"
+            f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: without view.samples, "
+            "there are as many samples for each as put it within 5 %"
         )
     if words := preset_note(experiment):
         notes.append(words)

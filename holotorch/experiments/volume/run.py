@@ -75,7 +75,9 @@ def fingerprint_inputs(experiment: VolumeExperiment) -> tuple[VolumeSettings, di
     }
     if file:
         inputs["transfer.file"] = (Path(file).read_bytes(),)
-    return experiment.settings, inputs, {"device", "report.seeds"}
+    if experiment.samples > 1:  # checkpoints of before had one
+        inputs["samples"] = (repr(experiment.samples),)
+    return experiment.settings, inputs, {"device", "report.seeds", "view.samples"}
 
 
 class _State:

@@ -38,17 +38,29 @@ def test_without_a_tolerance_nothing_changes():
     assert len(plan.values["planes_mm"]) == 5 and plan.values["stop_below"] == 0 and "L-BFGS, 60 steps" in plan.text
     assert plan.values["taps"] == 5 and plan.values["precision"] == "complex64"
     assert list(parts(plan.values)) == ["heat", "planes", "propagation"] and "by default" in plan.text
-    assert "thin parts of it broken" in plan.text and "slices of it" not in plan.text  # 5 planes are 37 % off
+    assert parts(plan.values)["planes"]["predicted_error"] < 0.05 and "off this volume" not in plan.text
 
 
-def test_planes_that_are_slices_of_a_volume_rather_than_the_volume_are_noted():
-    plan = check(settings("display.planes=2"))
+@pytest.mark.parametrize(("planes", "shown"), [(5, "thin parts of it broken"), (2, "slices of it")])
+def test_too_few_samples_of_a_volume_are_noted(planes, shown):
+    """With one for each plane, 5 planes are 37 % off, and 2 more than 50 %."""
+    plan = check(settings(f"display.planes={planes}", "view.samples=1"))
     error = parts(plan.values)["planes"]["predicted_error"]
-    assert error > 0.5
     (note,) = [line for line in plan.text.splitlines() if "off this volume" in line]
-    assert f"2 planes are {error:.0%} off" in note and "; display.planes=" in note
-    with_slabs = check(settings("display.planes=2", "frames=2", "report.baselines=[slabs]"))
-    assert re.search(r"; display.planes=(\d+) frames=\1 would be \d+% off", with_slabs.text)
+    assert f"{error:.0%} off" in note and shown in note and "without view.samples" in note
+    sampled = check(settings(f"display.planes={planes}"))
+    assert parts(sampled.values)["planes"]["predicted_error"] < 0.05 and "off this volume" not in sampled.text
+
+
+def test_planes_far_apart_are_noted_with_a_number_that_is_not():
+    """520 nm, sine 0.0202: a depth of focus of 1.27 mm; planes 2.5 mm apart."""
+    (note,) = [
+        line for line in check(settings("display.planes=2", "eye.pupil=0.7")).text.splitlines() if " apart" in line
+    ]
+    number = re.search(r"; display.planes=(\d+) puts it where it belongs", note)
+    assert number and "planes are" not in check(settings(f"display.planes={number[1]}", "eye.pupil=0.7")).text
+    with_slabs = check(settings("display.planes=2", "eye.pupil=0.7", "frames=2", "report.baselines=[slabs]"))
+    assert re.search(r"; display.planes=(\d+) frames=\1 puts", with_slabs.text)
 
 
 @pytest.mark.parametrize(("planes", "foci"), [(4, 4), (8, 8), (9, 8), (40, 9), (200, 9)])
@@ -81,14 +93,12 @@ def test_fewer_foci_correct_all_planes_as_well():
 
 
 def test_no_note_proposes_more_planes_than_a_run_takes():
-    """160 planes are as far off this volume as 5: rays of it end at different voxels."""
-    words = "transfer={points: [[0, 1, 1, 1, 0], [254, 1, 1, 1, 0], [255, 1, 1, 1, 1]]}"
-    for planes in (5, MOST_PLANES // 2, MOST_PLANES):
-        text = check(settings(f"display.planes={planes}", words)).text
+    """Of a volume that is stretched to 1.9 m, the planes are never close enough."""
+    words = "display.distance=1 m", "display.depth=1.9 m"
+    for planes in (5, MOST_PLANES):
+        text = check(settings(f"display.planes={planes}", *words)).text
         proposed = [int(each) for each in re.findall(r"display\.planes=(\d+)", text)]
-        assert all(planes < each <= MOST_PLANES for each in proposed)
-        if planes == MOST_PLANES and "off this volume" in text:
-            assert "more of them are not accepted" in text
+        assert proposed == [MOST_PLANES] * (planes < MOST_PLANES) and "a smaller pupil" in text
 
 
 def test_a_volume_wider_than_the_array_is_noted_with_the_width_that_fits():
@@ -110,7 +120,7 @@ def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():
 
 
 def test_a_number_of_planes_wins_and_slabs_take_no_more_than_there_are_frames():
-    given = check(settings("tolerance=0.05", "display.planes=3"))
+    given = check(settings("tolerance=0.05", "display.planes=3", "view.samples=1"))
     assert len(given.values["planes_mm"]) == 3 and parts(given.values)["planes"]["from"] == "display.planes"
     assert "exceeds it" in given.text
     assert len(check(settings("tolerance=0.05", "report.baselines=[slabs]")).values["planes_mm"]) == 4
@@ -120,15 +130,17 @@ def test_a_number_of_planes_wins_and_slabs_take_no_more_than_there_are_frames():
     "words",
     [[], ["heat={frame_us: 20, time_constant_us: 10}"], ["eye.parallax=2"], ["display.planes=2"], ["display.planes=1"]],
 )
-def test_measured_errors_are_about_those_predicted(words):
+@pytest.mark.parametrize("samples", ["1", "null"])
+def test_measured_errors_are_about_those_predicted(words, samples):
+    words = [*words, f"view.samples={samples}"]
     made = build(settings("tolerance=0.3", "steps=20", *words))
     assert isinstance(made, JointExperiment)
     measured = {each.part: each for each in joint_errors(made, made.solve())}
     assert list(measured) == ["heat", "planes", "propagation", "stopping"]
     for each in measured.values():
         assert each.measured is not None and each.measured <= 2 * each.predicted, each
-    # The prediction for one plane, far from the asymptotic error, is that of a few rays.
-    assert measured["planes"].measured == pytest.approx(measured["planes"].predicted, rel=0.5)
+    if samples == "1":  # errors of few per thousand, of many samples, are not asymptotic in a phantom of 24 voxels
+        assert measured["planes"].measured == pytest.approx(measured["planes"].predicted, rel=0.5)
 
 
 def test_a_tight_tolerance_is_solved_in_double_precision():

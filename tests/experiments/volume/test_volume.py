@@ -310,6 +310,32 @@ def test_joined_planes_are_as_dark_as_all_of_them(name, monkeypatch):
     assert (build(config).quick_rendering(64, lit=False) - pictures[0]).norm() > 0.1 * pictures[0].norm()
 
 
+def test_few_planes_show_the_whole_volume_and_not_slices_of_it():
+    """Against two hundred samples for each of four planes; with one, as in the thesis, the rendering is 20 % off."""
+    words = "volume={phantom: shells, samples: 48}", "hologram.depths=4"
+    wanted = build(settings(*words, "view.samples=200")).rendering()[0]
+    errors = {}
+    for given in ("1", "null"):
+        experiment = build(settings(*words, f"view.samples={given}"))
+        plan = plan_values(experiment)
+        errors[given] = float((experiment.rendering()[0] - wanted).norm() / wanted.norm())
+        assert plan["slab_error"] == pytest.approx(errors[given], rel=0.5, abs=0.01)
+        assert any("without view.samples" in note for note in plan["notes"]) == (given == "1")
+        assert f"{plan['samples']} sample(s) of the volume for each" in plan_text(experiment, plan)
+        light = torch.stack([plane.abs().square() for plane in experiment.layers().amplitudes()]).sum(0)[:3]
+        torch.testing.assert_close(light, experiment.rendering()[0], rtol=1e-4, atol=1e-5)
+    assert errors["1"] > 0.2 and errors["null"] < 0.06
+
+
+def test_other_samples_do_not_continue_a_run(tmp_path, monkeypatch):
+    words = "report.seeds=2", "hologram.depths=4"
+    with monkeypatch.context() as patch:
+        patch.setattr(volume_run._State, "add", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        execute(settings(*words), tmp_path / "a", "a")
+    with pytest.raises(ConfigError, match="another configuration: view.samples"):
+        execute(settings(*words, "view.samples=1"), tmp_path / "a", "a")
+
+
 def test_a_check_of_many_planes_renders_few(monkeypatch, capsys):
     counts, picture = [], March.picture
     monkeypatch.setattr(March, "picture", lambda march, *wanted: counts.append(len(march.spans)) or picture(march))

@@ -38,5 +38,6 @@ def coarser(settings: VolumeSettings, largest: int) -> int:
 def turned(experiment: VolumeExperiment, azimuth: float, elevation: float, divisor: int = 1) -> VolumeExperiment:
     """The experiment with another orientation in degrees, and with all its lengths and counts divided."""
     settings = experiment.settings
-    view = settings.view.model_copy(update={"azimuth_deg": azimuth, "elevation_deg": elevation})
+    update = {"azimuth_deg": azimuth, "elevation_deg": elevation, "samples": experiment.samples}
+    view = settings.view.model_copy(update=update)
     return replace(experiment, settings=settings.model_copy(update={"view": view, "scale": settings.scale * divisor}))
