@@ -70,8 +70,8 @@ class March:
     @property
     def thickest(self) -> float:
         """Thickness of the thickest part of a slab that is one sample, in the smallest distance between voxels."""
-        thickness = max((high - low for span in self.spans for low, high in self.parts(*span)), default=0.0)
-        return thickness / min(self.place.spacing)
+        thickness = [high - low for span in self.spans for low, high in self.parts(*span)]
+        return max([0.0, *thickness]) / min(self.place.spacing)
 
     def parts(self, low: float, high: float) -> list[tuple[float, float]]:
         """Smallest and largest depths of the parts of a slab, front to back; none for a slab beside the volume."""
@@ -129,20 +129,33 @@ class March:
         # One zero, expanded to the shape of a plane without allocating it.
         dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(self.channels, *self.rays.grid.shape)
         done = 0
-        for plane, steps in itertools.groupby(self.steps(selected), lambda step: step.plane):
+        for plane, rays, radiance in self._sources(selected):
             yield from [dark] * (plane - done)
             done = plane + 1
-            scale, window, step = self.rays.scale(self.depths[plane]), self.zeros(self.channels), next(steps)
-            if self.samples == 1 and fill is None and scale == 1:  # the root of the few rays that contribute
-                yield self.whole(window.index_copy_(1, step.rays, safe_sqrt(step.weight * step.colour)))
-                continue
-            for each in itertools.chain([step], steps):
-                window.index_add_(1, each.rays, each.weight * each.colour)
+            scale, window = self.rays.scale(self.depths[plane]), self.zeros(self.channels)
             if fill is not None:
-                yield safe_sqrt(fill(self.whole(window)))
+                yield safe_sqrt(fill(self.whole(window.index_copy_(1, rays, radiance))))
+            elif scale == 1:
+                yield self.whole(window.index_copy_(1, rays, safe_sqrt(radiance)))
             else:
-                yield safe_sqrt(self.whole(window) if scale == 1 else self._resampled(window, scale))
+                yield safe_sqrt(self._resampled(window.index_copy_(1, rays, radiance), scale))
         yield from [dark] * (len(self.depths) - done)
+
+    def _sources(self, selected: Tensor | None) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Yield each plane that has a contribution, its rays [n], and their radiance [C, n] from all samples."""
+        if self.samples == 1:
+            for step in self.steps(selected):
+                yield step.plane, step.rays, step.weight * step.colour
+            return
+        plane, every, window = -1, torch.arange(self.window.size, device=self.device), self.zeros(self.channels)
+        for step in self.steps(selected):
+            if step.plane != plane:
+                if plane >= 0:
+                    yield plane, every, window
+                plane, window = step.plane, self.zeros(self.channels)
+            window.index_add_(1, step.rays, step.weight * step.colour)
+        if plane >= 0:
+            yield plane, every, window
 
     def zeros(self, channels: int) -> Tensor:
         """Zeros of shape [channels, rays of the window]."""
