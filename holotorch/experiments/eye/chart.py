@@ -55,7 +55,7 @@ def eye(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, bytes], 
     assert path is not None  # bundled with the package
     shape = f"shape: [{amount.side}, {amount.side}], depths: {amount.depths}, rays: {amount.side // 2}"
     hologram = f"hologram={{{shape}, pitch: 3.74 um, distance: 30 mm}}"
-    settings = load_config(path, [f"scene={{config: configs/volume/c60.yaml, change: ['{hologram}']}}"])
+    settings = load_config(path, [f"scene={{config: configs/volume/c60.yaml, change: ['{hologram}', view.samples=1]}}"])
     assert isinstance(settings, ObserverSettings)
     scene = scene_settings(settings)
     methods = _methods(_quarter_size(settings, scene))

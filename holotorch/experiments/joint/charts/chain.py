@@ -164,7 +164,8 @@ def _observer(size: int) -> Observer:
     paths = [find_config(f"configs/{kind}/teapot.yaml") for kind in ("eye", "volume")]
     assert paths[0] is not None and paths[1] is not None
     shape = f"hologram={{shape: [{size}, {size}], pitch: {PITCH}, distance: {DISTANCE}, depths: {PLANES}}}"
-    scene = load_config(paths[1], [shape, *volume_file("teapot")])
+    # One sample of the volume for each plane, as in the dissertation.
+    scene = load_config(paths[1], [shape, "view.samples=1", *volume_file("teapot")])
     return observer(load_config(paths[0]), scene)
 
 
