@@ -15,8 +15,18 @@ from holotorch.experiments.sweep.points import Point
 from holotorch.io.files import read_json, write_bytes
 
 TABLE, PICTURE, PAGE = "sweep.csv", "sweep.png", "report.html"
-# Quantities to draw, by the last part of a column's name: the first of these that vary between runs.
-_MERITS = ("ssim_mean", "ssim", "psnr_mean", "psnr", "psnr_db", "contrast", "error", "loss", "seconds")
+# Quantities to draw, by the last part of a column's name, and what they are: the first of these that vary between runs.
+_MERITS = {
+    "ssim_mean": "SSIM, mean",
+    "ssim": "SSIM",
+    "psnr_mean": "PSNR in dB, mean",
+    "psnr": "PSNR in dB",
+    "psnr_db": "PSNR in dB",
+    "contrast": "speckle contrast",
+    "error": "error",
+    "loss": "loss",
+    "seconds": "seconds",
+}
 _PANELS = 3
 
 
@@ -67,7 +77,7 @@ def draw(out: Path, points: Sequence[Point], summaries: dict[str, dict[str, Any]
             axes.set_xticks(range(len(ticks)), ticks, fontsize=8)
         elif min(x) > 0 and max(x) / min(x) >= 30:
             axes.set_xscale("log")
-        axes.set(xlabel=key, ylabel=merit)
+        axes.set(xlabel=key, ylabel=f"{_MERITS[merit.rpartition('.')[2]]}\n({merit} in {TABLE})")
         axes.grid(alpha=0.3)
         if any(lines) and len(lines) <= 12:
             axes.legend(fontsize=7)
