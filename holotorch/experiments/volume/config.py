@@ -23,6 +23,7 @@ from holotorch.experiments.config.settings import (
 )
 
 _MOST_WAVELENGTHS = 32
+MOST_SAMPLES = 1024
 Scene = Literal["tooth", "teapot", "bonsai", "engine", "c60", "hand"]
 Phantom = Literal["shells", "c60", "marschner_lobb", "gaussian_ball"]
 
@@ -135,7 +136,7 @@ class ViewSettings(Settings):
     lighting: bool = False
     scattering: ScatteringSettings | None = None
     adaptive: Annotated[Number, Field(ge=0, le=1)] | None = None
-    samples: Annotated[Count, Field(le=1024)] | None = None
+    samples: Annotated[Count, Field(le=MOST_SAMPLES)] | None = None
 
 
 class HologramSettings(GridSettings):

@@ -17,7 +17,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.planning.tolerance import Budget
 from holotorch.experiments.planning.tolerance import Part as ErringPart
 from holotorch.experiments.runs.environment import find_device
-from holotorch.experiments.volume.config import TransferSettings, VolumeSettings, VolumeSource
+from holotorch.experiments.volume.config import MOST_SAMPLES, TransferSettings, VolumeSettings, VolumeSource
 from holotorch.hologram import AxialHologram, ConvolutionHologram, HologramPlan, plan_hologram
 from holotorch.io.catalogue import PUBLISHED, fetch_volume
 from holotorch.io.colour_tables import colour_shares, picture_matrix
@@ -194,11 +194,12 @@ class VolumeExperiment:
     @cached_property
     def samples(self) -> int:
         """Samples of the volume along a ray within each slab."""
-        given = self.settings.view.samples
-        if given is not None or self.single_error <= _CLOSE:
-            return given or 1
+        if (given := self.settings.view.samples) is not None:
+            return given
+        if self.single_error <= _CLOSE:
+            return 1
         # The error falls with their square, once they are close enough; two for each voxel are.
-        finest = 2 * max(self.volume.shape) // len(self.depths) + 1
+        finest = min(MOST_SAMPLES, 2 * max(self.volume.shape) // len(self.depths) + 1)
         few = min(finest, math.ceil(math.sqrt(self.single_error / _CLOSE)))
         return few if few == finest or self._slab_error(few) <= _CLOSE else finest
 

@@ -47,7 +47,7 @@ def test_parts_of_a_phantom_are_sharpest_in_focus():
 
 @pytest.mark.skipif(not BONSAI.exists(), reason="the CT of a bonsai is not here; the phantom's test covers the path")
 def test_parts_of_a_real_volume_are_sharpest_in_focus():
-    eye = looking(REAL % BONSAI, "focus=[10 mm]", "eye.tolerance=0.06")  # the faster method throughout
+    eye = looking(REAL % BONSAI, "focus=[10 mm]")
     in_focus(focus_sweep(eye, SweepSettings(bands=5, steps=9, realisations=4)), 5)
 
 
