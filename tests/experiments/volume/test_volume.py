@@ -330,10 +330,14 @@ def test_few_planes_show_the_whole_volume_and_not_slices_of_it():
 def test_other_samples_do_not_continue_a_run(tmp_path, monkeypatch):
     words = "report.seeds=2", "hologram.depths=4"
     with monkeypatch.context() as patch:
-        patch.setattr(volume_run._State, "add", lambda *_: os.kill(os.getpid(), signal.SIGINT))
-        execute(settings(*words), tmp_path / "a", "a")
+        press_in(patch, 1)
+        assert not execute(settings(*words), tmp_path / "a", "a")[1]
     with pytest.raises(ConfigError, match="another configuration: view.samples"):
         execute(settings(*words, "view.samples=1"), tmp_path / "a", "a")
+    config = tmp_path / "a" / "config.yaml"
+    config.write_text(config.read_text().replace("samples: null", "samples: 1"))
+    with pytest.raises(ConfigError, match="samples"):
+        execute(load_config(config), tmp_path / "a", "a")
 
 
 def test_a_check_of_many_planes_renders_few(monkeypatch, capsys):
