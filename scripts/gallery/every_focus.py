@@ -20,11 +20,9 @@ def main(out: Path, size: int = 128) -> None:
     """Write the wanted images of a C60 molecule and those of the array, by focus, to ``out``."""
     grid, wavelength, heat = Grid(size, 9e-6), 520e-9, ThermalCrosstalk(0.66)
     transfer = TransferFunction([0.0, 0.3, 1.0], [[0] * 3, [0.6] * 3, [1] * 3], [0, 0, 0.6], unit_distance=0.01)
-    flat = [10e-3 + (j - 1.5) * 0.2e-3 for j in range(4)]  # the planes are rendered close together, then stretched
-    planes = torch.stack([*DVRSampler(transfer, grid, flat, width=size * 6e-6, samples=12)(c60(48)).amplitudes()])[
-        :, :1
-    ]
-    depths = [7e-3, 9e-3, 11e-3, 13e-3]
+    depths, flat = [7e-3, 9e-3, 11e-3, 13e-3], [9.7e-3, 9.9e-3, 10.1e-3, 10.3e-3]  # rendered flat, then stretched
+    sampler = DVRSampler(transfer, grid, flat, width=size * 6e-6, samples=12)
+    planes = torch.stack([*sampler(c60(48)).amplitudes()])[:, :1]
     views = [View(depth, radius=0.25 * wavelength / 9e-6) for depth in depths]
     wanted = incoherent_views(SourceLayers(grid, tuple(depths), 1, lambda: iter(planes)), wavelength, views)
     random = torch.polar(planes[:, 0].expand(8, -1, -1, -1), 2 * math.pi * torch.rand(8, 4, size, size))
