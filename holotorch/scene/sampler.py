@@ -166,7 +166,7 @@ class DVRSampler(nn.Module):
                 sums.index_add_(1, step.rays, torch.cat([step.weight * step.colour, step.weight[None]]))
             whole = alone.whole(sums)
             emission.append(whole[:-1])
-            opacity.append(whole[-1])
+            opacity.append(whole[-1].clamp(max=1))  # a sum of several weights may be above 1 by its rounding
         return SlabLayers(self.grid, self.depths, torch.stack(emission), torch.stack(opacity))
 
     def slab_error(self, volume: Volume) -> float:

@@ -357,6 +357,15 @@ def test_samples_bring_the_rendering_of_few_planes_near_that_of_many(recwarn):
     assert len(recwarn) == (errors[0] > 0.25)
 
 
+def test_opaque_slabs_of_many_samples_let_no_light_through():
+    """In single precision, the sum of their weights may be above 1 by its rounding."""
+    table = TransferFunction(torch.tensor([0.0, 1.0]), torch.ones(2, 3), torch.tensor([0.0, 1.0]), unit_distance=0.02)
+    volume = Volume(torch.rand(24, 24, 24), (1.0, 1.0, 1.0), "relative")
+    layers = sampler(table, depths=DEPTHS[::4], samples=13).slab_layers(volume)
+    assert layers.opacity.max() == 1
+    assert layers.towards((0.0, 0.0)).min() >= 0
+
+
 @pytest.mark.parametrize("count", [0, -1, 1.5, "2"])
 def test_a_number_of_samples_that_is_none(count):
     with pytest.raises((TypeError, ValueError), match="samples"):

@@ -66,8 +66,8 @@ MEANINGS = {
     "ViewSettings.elevation_deg": "rotation of the volume about the horizontal axis: more shows more of its top",
     "ViewSettings.width": "length of the volume's longest side; by default the longest side of the hologram",
     "ViewSettings.front": "which end of the volume, from the hologram on, faces the observer",
-    "ViewSettings.samples": "samples of the volume in the slab of each plane; by default as many as put the rendering "
-    "within 5 % of that with very many",
+    "ViewSettings.samples": "samples of the volume in the slab of each plane; by default 1, or two for each voxel "
+    "where that is more than 1 % off",
     "ViewSettings.lighting": "shade points by the gradient of the volume",
     "HologramSettings.distance": "distance from the hologram to the middle of the volume",
     "HologramSettings.depths": "number of planes, or their distances",

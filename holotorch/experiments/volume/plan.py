@@ -209,7 +209,7 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
     if slab_error > _COARSE_SLABS:
         notes.append(
             f"slabs this thick put the rendering {slab_error:.0%} off the one with thin slabs: without view.samples, "
-            "there are as many samples for each as put it within 5 %"
+            "each is sampled twice for each voxel"
         )
     if words := preset_note(experiment):
         notes.append(words)

@@ -38,6 +38,7 @@ def coarser(settings: VolumeSettings, largest: int) -> int:
 def turned(experiment: VolumeExperiment, azimuth: float, elevation: float, divisor: int = 1) -> VolumeExperiment:
     """The experiment with another orientation in degrees, and with all its lengths and counts divided."""
     settings = experiment.settings
-    update = {"azimuth_deg": azimuth, "elevation_deg": elevation, "samples": experiment.samples}
+    samples = max(1, experiment.samples // divisor)  # a moving volume may be rough
+    update = {"azimuth_deg": azimuth, "elevation_deg": elevation, "samples": samples}
     view = settings.view.model_copy(update=update)
     return replace(experiment, settings=settings.model_copy(update={"view": view, "scale": settings.scale * divisor}))
