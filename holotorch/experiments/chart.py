@@ -54,6 +54,7 @@ CHARTS = {
     "pec": Subject("holotorch.experiments.pec_study.chart", "comparison", minutes=13, gigabytes=0.44),
     "network": Subject("holotorch.experiments.network.chart", "training", minutes=6.6, gigabytes=0.67),
     "joint": Subject("holotorch.experiments.joint.charts.chart", minutes=33, gigabytes=0.89),
+    "whole": Subject("holotorch.experiments.joint.charts.whole", minutes=33, gigabytes=0.89),
     "chain": Subject("holotorch.experiments.joint.charts.chain", gigabytes=4.8),
     "tracking": Subject("holotorch.experiments.tracking_benchmark.chart", "grids", minutes=54, gigabytes=1.2),
 }

@@ -9,7 +9,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.registry import KINDS, find_kind
 from holotorch.experiments.runs.page import page, plain, render
 from holotorch.experiments.runs.record import SUMMARIES, RunRecord
-from holotorch.io.files import write_text
+from holotorch.io.files import read_json, write_text
 
 
 def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | None = None) -> None:
@@ -42,6 +42,8 @@ def outcome_lines(folder: Path) -> list[str]:
             lines += find_kind(run.kind).outcome(run.summary) if run.kind in KINDS else []
             if run.summary.get("status") == "interrupted":
                 lines = [re.sub("^Result {5}", "Unfinished ", line) for line in lines]
+            if (plan := folder / "plan.json").is_file():  # the plan itself is out of sight after a long run
+                lines += [f"WARNING    {warning}" for warning in read_json(plan).get("warnings", [])]
     if any((folder / "images").glob("*.png")):
         lines.append(f"Pictures   {folder / 'images'}")
     return lines

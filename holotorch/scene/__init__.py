@@ -15,7 +15,7 @@ from holotorch.scene.phantoms import (
 from holotorch.scene.phases import PointPhases, point_phases, random_phase, smooth_phase
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.transfer import TransferFunction
-from holotorch.scene.transfer_presets import bone, industrial, soft_tissue, transfer_from_json, vessels
+from holotorch.scene.transfer_presets import bone, industrial, skin, soft_tissue, transfer_from_json, vessels
 from holotorch.scene.volume import Volume
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "sample_adaptively",
     "shells",
     "smooth_phase",
+    "skin",
     "soft_tissue",
     "transfer_from_json",
     "vessels",

@@ -28,6 +28,11 @@ _SOFT_TISSUE = [
     (0.60, 0.98, 0.90, 0.80, 0.30),
     (1.00, 1.00, 1.00, 0.95, 0.60),
 ]
+_SKIN = [
+    (0.00, 0.80, 0.55, 0.45, 0.00),
+    (0.06, 0.90, 0.68, 0.56, 0.90),
+    (1.00, 1.00, 0.90, 0.80, 0.95),
+]
 _VESSELS = [
     (0.00, 0.30, 0.00, 0.00, 0.00),
     (0.25, 0.45, 0.02, 0.02, 0.00),
@@ -52,6 +57,11 @@ def bone(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> Tr
 def soft_tissue(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
     """Translucent skin and muscle over bone; ``low`` is air, ``high`` the densest bone."""
     return _scaled(_SOFT_TISSUE, low, high, unit_distance)
+
+
+def skin(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
+    """Opaque skin, whose shape needs :class:`Lighting`; ``low`` is air, ``high`` the densest bone."""
+    return _scaled(_SKIN, low, high, unit_distance)
 
 
 def vessels(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:

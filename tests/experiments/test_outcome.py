@@ -30,10 +30,9 @@ def wanted(kind: str, summary: dict) -> list[str]:
     if kind == "joint":
         methods = summary["methods"]
         stack, half = (methods["joint"][f"{name}_psnr"] for name in ("stack", "half"))
-        own = f"PSNR {stack:.1f} dB at the corrected foci, of pictures that are {summary['measured_error']:.0%} off the"
         return [
-            own,
-            f" volume; {half:.1f} dB through half pupils",
+            f"PSNR {stack:.1f} dB at the corrected foci; {half:.1f} dB through half pupils",
+            f"hottest pixel {methods['joint']['peak_temperature_K']:.0f} degC above ambient",
             f": {max(methods[name]['stack_psnr'] for name in ('afterwards', 'slabs')):.1f} dB at",
         ]
     if kind == "study":
@@ -64,8 +63,13 @@ def test_a_run_ends_with_its_main_numbers_its_pictures_and_its_report(kind, tmp_
     for words in wanted(kind, summary):
         assert sum(words in line for line in last) == 1, (words, last)
     if "predicted_error" in summary:
-        assert f"itself: {100 * summary['measured_error']:.2g} % measured" in last[-3]
-        assert f"{100 * summary['predicted_error']:.2g} % predicted" in last[-3]
+        (error,) = [line for line in last if line.startswith("Error")]
+        assert f"itself: {100 * summary['measured_error']:.2g} % measured" in error
+        assert f"{100 * summary['predicted_error']:.2g} % predicted" in error
+    plan = json.loads((folder / "plan.json").read_text()) if (folder / "plan.json").is_file() else {}
+    assert [line for line in last if line.startswith("WARNING")] == [
+        f"WARNING    {warning}" for warning in plan.get("warnings", [])
+    ]
 
 
 def test_a_complete_run_whose_summary_is_damaged_is_refused(tmp_path, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.scene.transfer_presets import bone, industrial, soft_tissue, transfer_from_json, vessels
+from holotorch.scene.transfer_presets import bone, industrial, skin, soft_tissue, transfer_from_json, vessels
 
 PARAVIEW = {
     "ColorSpace": "RGB",
@@ -68,6 +68,11 @@ def test_presets_follow_the_range_and_leave_air_clear(preset):
     assert small(torch.tensor(0.1))[1] == 0 < small(torch.tensor(0.9))[1] < 1
     with pytest.raises(ValueError, match="low must be below high, got 5 and 5"):
         preset(5, 5)
+
+
+def test_skin_is_opaque_from_just_above_air_on():
+    assert skin(20, 120)(torch.tensor(20.0))[1] == 0
+    torch.testing.assert_close(skin(20, 120)(torch.tensor(26.0))[1], torch.tensor(0.9), rtol=0, atol=1e-5)
 
 
 def test_paraview_map_with_its_own_positions_and_a_moved_midpoint():

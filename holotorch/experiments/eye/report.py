@@ -32,7 +32,9 @@ def eye_outcome(summary: dict[str, Any]) -> list[str]:
             _mean([v for row in rows if row["source"] == source for v in row[key]]) for key in ("ssim", "contrast")
         ]
         each.append("{}: SSIM {}, speckle contrast {}".format(source.replace("_", " "), *scores))
-    text = "Result     of the picture on the retina, against one without speckle, mean over foci and colours: "
+    text = (
+        "Result     of the picture on the retina, against the mean of other realisations, mean over foci and colours: "
+    )
     return [*([text + "; ".join(each)] if each else []), *error_line(summary)]
 
 

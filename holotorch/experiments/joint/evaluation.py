@@ -38,8 +38,13 @@ def evaluate(experiment: JointExperiment, shown: Shown) -> tuple[dict[str, Any],
         field = experiment.stack.operator(shown.fields)[:, :, len(experiment.foci) // 2]
         numbers["light_in_pupil"] = (intensity(field).sum() / intensity(shown.fields).sum()).item()
         if shown.phase is not None:
-            peak = experiment.heat(shown.phase).max().item()
+            peaks = experiment.heat(shown.phase).amax((0, 2, 3))  # of each colour
+            peak, display = peaks.max().item(), experiment.settings.display
+            kelvin = (
+                peaks * peaks.new_tensor(experiment.settings.wavelengths) / display.rad_per_K_at / display.rad_per_K
+            )
             numbers |= {"peak_phase_pi": peak / math.pi, "at_limit": peak > _AT_LIMIT * experiment.settings.limit}
+            numbers["peak_temperature_K"] = kelvin.max().item()
     return numbers, images
 
 

@@ -18,6 +18,7 @@ _PICTURES = {
 
 
 _POOR = 30.0  # dB of the corrected pictures below which a binding limit is named
+_POOR_PARTS = 25.0  # dB of the pictures through half pupils below which parts of the pupil are named
 _LITTLE = 0.05  # share of the light in pupil and window below which that is said beside the scores
 
 
@@ -34,6 +35,13 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
         ideal = " (no chip shows such fields)" if best == "random" else ""
         scores.append(f"the best other method, {NAMES[best]}{ideal}: {others[best]:.1f} dB at the corrected foci")
     poor = []
+    if corrected.get("half_psnr", math.inf) < _POOR_PARTS and corrected["stack_psnr"] > _POOR:
+        poor.append(
+            "Note       a pupil that moves sees less: eye.parallax=200 eye.per_step=6 corrects parts of the pupil, "
+            "too, in more time"
+        )
+    if (hottest := corrected.get("peak_temperature_K")) is not None:
+        scores.append(f"hottest pixel {hottest:.0f} degC above ambient")
     if corrected.get("at_limit") and corrected["stack_psnr"] < _POOR:
         poor.append(
             "Note       the phases are at their limit: a higher one (display.max_temperature or max_phase), more "

@@ -286,7 +286,8 @@ def _notes(experiment: PECExperiment) -> list[str]:
                 )
             notes.append(
                 f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "
-                f"detail of the picture cannot be formed; a sample is resolved up to {nearer * 1e3:.3g} mm "
+                "detail may be right at the samples, which SSIM and PSNR compare, but not between them (between.png); "
+                f"a sample is resolved up to {nearer * 1e3:.3g} mm "
                 f"(propagator.distance={nearer * 1e3:.3g}mm)"
             )
     elif len(experiment.wavelengths) > 1:

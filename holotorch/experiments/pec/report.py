@@ -48,6 +48,8 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
     hottest = max(corrected["peak_temperature_rise_K"])
     melts = ", where silicon has melted: modulator.max_temperature sets a limit" if hottest > _MELTING else ""
     scores.append(f"hottest pixel {hottest:.0f} degC above ambient{melts}")
+    if not all(corrected.get("converged", [True])) and not any(corrected.get("stalled", ())):
+        scores.append(f"the solver took all of its {max(corrected['steps'])} steps")
     kernel = [f"Kernel     {words}" for words in _other_kernels(corrected)]
     advice = []
     if corrected.get("frames") == 1 and corrected.get("ssim_mean", 1.0) < _POOR:

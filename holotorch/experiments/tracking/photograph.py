@@ -29,6 +29,7 @@ _SHOWN, _TILE = 20, 240  # pixels: the picture shows so many to each side of a p
 _ACROSS = 0.5  # of the distance to the nearest band's place: where a colour continues so wide, it is no tube's
 _SAME, _SAME_LEAST = 0.4, 12  # of a colour's chroma, and levels: a pixel whose chroma differs by less shows this colour
 _UNEVEN = 25  # levels: deviation within a box above which it probably holds more than one band
+_THIN = 0.3e-3  # metres: radius below which a unit is probably wrong; the thinnest catheters are near it
 _BRIGHT = 250  # level from which on a channel is probably saturated
 _STAND_INS = ((200, 40, 45), (40, 70, 190))  # colours of neighbouring bands until theirs are read
 _PLACE = re.compile(r"(\d{1,5}),(\d{1,5})(?:,(\d{1,5}),(\d{1,5}))?")
@@ -101,6 +102,8 @@ def calibrate_catheter(
         + (f"; {' and '.join(kept)} of {source}: measure yours and give --{' --'.join(kept)}" if kept else "")
     )
     notes = _notes(places, boxes, levels, spread, counts) + _beside(places, boxes, levels, pixels)
+    if tool.radius < _THIN:
+        notes.append(f"a tube of {2e3 * tool.radius:g} mm is thin: is the unit of its lengths right?")
     if doubt := ambiguity_text(ambiguities(camera, catheter)):
         notes.append(doubt)
     shown = (

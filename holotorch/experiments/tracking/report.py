@@ -169,8 +169,8 @@ _ADVICE = {
     Status.OUT_OF_FRAME: "the bands must lie within the picture",
     Status.OUTSIDE_CAMERA: "the camera's file says nothing there: calibrate with boards near the picture's edges",
     Status.INCONSISTENT: "no pose explains what was measured: are `edges`, `radius` (half the thickness) and camera "
-    "right, the bands named from the tip on, and all of them free?",
-    Status.UNCERTAIN: _LONGER,
+    "right, the bands named from the tip on, and all of them free and in view?",
+    Status.UNCERTAIN: f"are the lengths of the bands in their order, from the tip on? Or {_LONGER}",
 }
 
 

@@ -82,7 +82,7 @@ class TransferSettings(Settings):
 
     model_config = ConfigDict(json_schema_extra={"type": ["object", "string"]})
 
-    preset: Literal["bone", "soft_tissue", "vessels", "industrial"] | None = None
+    preset: Literal["bone", "soft_tissue", "skin", "vessels", "industrial"] | None = None
     low: Number | None = None
     high: Number | None = None
     file: ExistingPath | None = None

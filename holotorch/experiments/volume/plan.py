@@ -27,6 +27,7 @@ _BASE_BYTES = 410e6  # memory of the libraries
 _RAY_BYTES = 120  # memory of the renderer per ray
 _FEW_VALUES = 0.01  # share of the range of a volume below which points hardly lie among its values
 _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
+_DENSE, _STEEP = 0.5, 0.1  # opacity of a surface, and the part of the range of values within which it rises to that
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
 _LIT = 0.05  # value above which a ray is not black
@@ -140,8 +141,9 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide",
         f"View       {viewpoint(experiment)}",
         f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
-        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end first, {values['samples']} sample(s) "
-        f"of the volume for each; predicted error of the rendering: {100 * values['slab_error']:.2g} %",
+        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end towards the observer, "
+        f"{values['samples']} sample(s) of the volume for each; predicted error of the rendering: "
+        f"{100 * values['slab_error']:.2g} %",
         f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um; field of view "
         f"{', '.join(f'{angle:.2f}' for angle in physics['field_of_view_deg'])} deg",
     ]
@@ -213,8 +215,21 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
         )
     if words := preset_note(experiment):
         notes.append(words)
-    notes += _other_values(experiment)
+    notes += _other_values(experiment) + unlit(experiment)
     return notes + cut_off(experiment, "rays")
+
+
+def unlit(experiment: VolumeExperiment) -> list[str]:
+    """A note on opaque surfaces that nothing shades."""
+    view, transfer = experiment.settings.view, experiment.transfer
+    clear = transfer.positions[transfer.opacities == 0]
+    dense = transfer.positions[transfer.opacities > _DENSE]
+    if view.lighting or view.scattering or not len(clear) or not len(dense):
+        return []
+    width, extent = (dense[0] - clear[clear < dense[0]].amax()).item(), (transfer.positions[-1] - clear[0]).item()
+    if width > _STEEP * extent:
+        return []
+    return ["the transfer function shows opaque surfaces, whose shape is seen with view.lighting=true"]
 
 
 def _other_values(experiment: VolumeExperiment) -> list[str]:
@@ -240,10 +255,16 @@ def _beside_the_scene(experiment: VolumeExperiment) -> list[str]:
     outside = [depth for depth in experiment.refocus if not nearest - margin <= depth <= farthest + margin]
     if not outside:
         return []
+    scale = experiment.settings.scale
+    meant = [depth * scale for depth in outside]
+    typed = ""
+    if scale > 1 and all(nearest - margin <= depth <= farthest + margin for depth in meant):
+        typed = f"; for {_millimetres(meant)} of this plan give {_millimetres([depth * scale for depth in meant])}"
     return [
-        f"report.refocus: {_millimetres(outside)}{_by(experiment.settings.scale)} lies beside the scene, which extends "
+        f"report.refocus: {_millimetres(outside)}{_by(scale)} lies beside the scene, which extends "
         f"from {nearest * 1e3:.4g} to {farthest * 1e3:.4g} mm: pictures there are blurred. SSIM takes each ray from "
-        "the picture that is refocused nearest to it; leave report.refocus out, and depths within the scene are taken"
+        "the picture that is refocused nearest to it; leave report.refocus out, and depths within the scene are "
+        f"taken{typed}"
     ]
 
 

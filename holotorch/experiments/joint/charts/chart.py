@@ -64,6 +64,7 @@ class Amount:
     bits: tuple[int, ...] = (4, 6, 8)  # of the heaters
     light: tuple[float, ...] = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)  # weights of the light that misses the pupil
     wrong: tuple[float, ...] = (0.01, 0.05, 0.1)  # relative errors of sigma in the model
+    samples: int | None = 1  # of the volume for each plane, 1 as in the thesis; None for as many as needed
 
 
 FULL = Amount()
@@ -81,9 +82,16 @@ QUICK = Amount(
 )
 
 
-def joint(quick: bool = False) -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
+Chart = tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]
+
+
+def joint(quick: bool = False) -> Chart:
     """Table rows of all cases, further tables by name, PNG figures by name, and lines of text."""
-    amount = QUICK if quick else FULL
+    return drawn(QUICK if quick else FULL)
+
+
+def drawn(amount: Amount) -> Chart:
+    """The same of a measurement of any size."""
     cases = {name: CASES[name] for name in amount.cases}
     rows: list[dict[str, Any]] = []
     memory: list[dict[str, Any]] = []
@@ -113,6 +121,7 @@ def _experiment(scene: str, seed: int, changes: list[str], amount: Amount) -> Jo
     steps = amount.steps * (STEPS_OF_ADAM if PARALLAX in changes else 1)
     words = ["wavelengths=[520 nm]", f"seed={seed}", f"steps={steps}"]
     words += [f"display.shape=[{amount.size},{amount.size}]", "eye={}", *changes]
+    words += [] if amount.samples is None else [f"view.samples={amount.samples}"]
     settings = load_config(path, words + volume_file(scene))
     assert isinstance(settings, JointSettings)
     return build(settings)
