@@ -277,7 +277,7 @@ def test_a_run_with_few_poses_says_what_to_look_at(tmp_path):
     first, second = refusals({"refused": refused, "answered": 3, "frames": 10})
     assert first.startswith(f"Refused    4 like frame 1, INCONSISTENT: {wide.format(0.45)}; no pose explains")
     assert "`radius` (half the thickness)" in first
-    assert second.startswith("Refused    2 like frame 5, UNCERTAIN: tip uncertain to 3.0 mm; are the lengths of the bands")
+    assert second.startswith("Refused    2 like frame 5, UNCERTAIN: tip uncertain to 3.0 mm; are the lengths of the ")
     assert refusals({"refused": refused, "answered": 22, "frames": 29})
     few = {"refused": refused, "answered": 2, "frames": 9, "statuses": {"OK": 2, "INCONSISTENT": 7}}
     assert "the 2 poses beside so many contradictions may be wrong" in refusals(few)[-1]
