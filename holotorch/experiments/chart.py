@@ -56,7 +56,7 @@ CHARTS = {
     "joint": Subject("holotorch.experiments.joint.charts.chart", minutes=33, gigabytes=0.89),
     "whole": Subject("holotorch.experiments.joint.charts.whole", minutes=33, gigabytes=0.89),
     "chain": Subject("holotorch.experiments.joint.charts.chain", gigabytes=4.8),
-    "tracking": Subject("holotorch.experiments.tracking_benchmark.chart", "grids", minutes=54, gigabytes=1.2),
+    "tracking": Subject("holotorch.experiments.tracking_benchmark.chart", "grids", minutes=90, gigabytes=1.2),
 }
 QUICK_FORM = "Quick form: smaller and fewer cases, no goal is tested"  # how the verdict of a quick chart begins
 
