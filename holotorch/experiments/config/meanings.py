@@ -67,7 +67,7 @@ MEANINGS = {
     "ViewSettings.width": "length of the volume's longest side; by default the longest side of the hologram",
     "ViewSettings.front": "which end of the volume, from the hologram on, faces the observer",
     "ViewSettings.samples": "samples of the volume in the slab of each plane; by default 1, or two for each voxel "
-    "where that is more than 1 % off",
+    "where that is more than 0.3 % off",
     "ViewSettings.lighting": "shade points by the gradient of the volume",
     "HologramSettings.distance": "distance from the hologram to the middle of the volume",
     "HologramSettings.depths": "number of planes, or their distances",

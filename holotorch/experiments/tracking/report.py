@@ -33,6 +33,7 @@ COLUMNS = (
 
 _STATED = "the uncertainty from the frames alone, without that of the calibration of the camera and of the band edges"
 _MOVED = 3.0  # largest spread of the tips of a resting catheter, as a multiple of the tracker's standard deviation
+_MANY = 5  # ratio of answered to refused frames above which the files of camera and catheter are hardly the cause
 _SHOWN = 4  # number of kinds of refusals that are counted with their first frame
 
 
@@ -174,6 +175,9 @@ _ADVICE = {
 }
 
 
+_SINGLE = "the files fit the other frames: is something across or beside a band there, or a highlight on it?"
+
+
 def verdict(summary: dict[str, Any]) -> str:
     """The summary in one line."""
     statuses = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
@@ -191,7 +195,9 @@ def refusals(summary: dict[str, Any]) -> list[str]:
     if not refused or 50 * (summary["frames"] - summary["answered"]) < summary["frames"]:
         return []
     common = [each for each in refused if 2 * each["frames"] >= refused[0]["frames"]]
-    lines = [f"Refused    {each['frames']} like {each['first']}; {_ADVICE[Status[each['status']]]}" for each in common]
+    few = summary["answered"] > _MANY * (summary["frames"] - summary["answered"])
+    advice = _ADVICE | ({Status.INCONSISTENT: _SINGLE} if few else {})
+    lines = [f"Refused    {each['frames']} like {each['first']}; {advice[Status[each['status']]]}" for each in common]
     wrong = summary.get("statuses", {}).get(Status.INCONSISTENT.name, 0)
     if summary["answered"] and wrong > 3 * summary["answered"]:
         lines.append(f"Warning    the {summary['answered']} poses beside so many contradictions may be wrong, too")

@@ -125,7 +125,8 @@ class ViewSettings(Settings):
     ``lighting`` shades points by the gradient of the volume; ``scattering`` in its place gives the volume shadows.
     ``adaptive``: follow all rays only where colours or opacity of every fourth ray differ by more than this.
     ``samples``: samples of the volume along a ray within the slab of each plane, whose light the plane shows; the
-    thesis has 1. By default 1, or two for each voxel where 1 puts the rendering more than 1 % off that with very many.
+    thesis has 1. By default 1, or two for each voxel where 1 puts the rendering more than 0.3 % off that with very
+    many.
     """
 
     up: Literal["-y", "y", "z", "-z", "x", "-x"] = "-y"

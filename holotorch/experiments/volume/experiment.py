@@ -38,7 +38,7 @@ _COUNTED = 1_000_000  # largest number of voxels in the histogram
 HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the tolerance of a run
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
-_CLOSE = 0.01  # predicted error above which slabs are sampled more than once; at 3 %, surfaces have rings
+_CLOSE = 0.003  # predicted error above which slabs are sampled more than once; at 1 %, surfaces have rings
 _QUICK_PLANES = 1000  # planes of a quick rendering at most; as many slabs as voxels along the depth are thin enough
 
 # Arguments in the messages of ``load_volume``, and the settings that stand for them; those named in full come first.

@@ -279,6 +279,8 @@ def test_a_run_with_few_poses_says_what_to_look_at(tmp_path):
     assert "`radius` (half the thickness)" in first
     assert second.startswith("Refused    2 like frame 5, UNCERTAIN: tip uncertain to 3.0 mm; are the lengths of the ")
     assert refusals({"refused": refused, "answered": 22, "frames": 29})
+    (single, _) = refusals({"refused": refused, "answered": 48, "frames": 55})
+    assert "the files fit the other frames: is something across or beside a band" in single
     few = {"refused": refused, "answered": 2, "frames": 9, "statuses": {"OK": 2, "INCONSISTENT": 7}}
     assert "the 2 poses beside so many contradictions may be wrong" in refusals(few)[-1]
     assert not refusals({"refused": refused, "answered": 593, "frames": 600})
