@@ -143,7 +143,7 @@ def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, error
     images = {name: in_colour(picture, experiment.settings.wavelengths) for name, picture in images.items()}
     for name, picture in images.items():
         files.write(save_picture, out / "images" / name, picture)
-    captions = ["Direct volume rendering", "Hologram, each ray in the nearest focus"]
+    captions = ["Direct volume rendering", "Hologram, nearest focus per ray"]
     captions += [f"Hologram refocused at {depth * 1e3:.4g} mm" for depth in evaluation.depths]
     captions = [caption + (", synthetic" if experiment.synthetic else "") for caption in captions]
     files.write(write_bytes, out / "images" / "comparison.png", figures.comparison([*images.values()], captions))
