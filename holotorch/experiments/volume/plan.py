@@ -222,12 +222,11 @@ def _notes(experiment: VolumeExperiment, slab_error: float) -> list[str]:
 def unlit(experiment: VolumeExperiment) -> list[str]:
     """A note on opaque surfaces that nothing shades."""
     view, transfer = experiment.settings.view, experiment.transfer
-    clear = transfer.positions[transfer.opacities == 0]
     dense = transfer.positions[transfer.opacities > _DENSE]
-    if view.lighting or view.scattering or not len(clear) or not len(dense):
+    if view.lighting or view.scattering or not len(dense):
         return []
-    width, extent = (dense[0] - clear[clear < dense[0]].amax()).item(), (transfer.positions[-1] - clear[0]).item()
-    if width > _STEEP * extent:
+    clear = transfer.positions[(transfer.opacities == 0) & (transfer.positions < dense[0])]
+    if not len(clear) or dense[0] - clear[-1] > _STEEP * (transfer.positions[-1] - clear[0]):
         return []
     return ["the transfer function shows opaque surfaces, whose shape is seen with view.lighting=true"]
 

@@ -327,6 +327,28 @@ def test_few_planes_show_the_whole_volume_and_not_slices_of_it():
     assert errors["1"] > 0.2 and errors["null"] < 0.06
 
 
+@pytest.mark.parametrize(
+    ("points", "view", "noted"),
+    [
+        ("[[10, 1, 1, 1, 0], [15, 1, 1, 1, 0.9], [255, 1, 1, 1, 0.9]]", "{}", True),
+        ("[[10, 1, 1, 1, 0], [15, 1, 1, 1, 0.9], [255, 1, 1, 1, 0.9]]", "{lighting: true}", False),
+        ("[[10, 1, 1, 1, 0], [255, 1, 1, 1, 0.9]]", "{}", False),
+        ("[[10, 1, 1, 1, 0.9], [255, 1, 1, 1, 0]]", "{}", False),
+    ],
+    ids=["a steep step", "lit", "a slow rise", "clear above only"],
+)
+def test_opaque_surfaces_that_nothing_shades_are_noted(points, view, noted):
+    plan = plan_values(build(settings(f"transfer={{points: {points}}}", f"view={view}")))
+    assert any("opaque surfaces" in note for note in plan["notes"]) == noted
+
+
+def test_a_focus_typed_as_the_plan_prints_it_is_answered_with_the_number_to_type():
+    warnings = plan_values(build(settings("scale=2", "report.refocus=[1.5 mm]")))["warnings"]
+    (warning,) = [each for each in warnings if each.startswith("report.refocus")]
+    assert "report.refocus: 0.75 mm (divided by the scale, 2)" in warning
+    assert warning.endswith("for 1.5 mm of this plan give 3 mm")
+
+
 def test_other_samples_do_not_continue_a_run(tmp_path, monkeypatch):
     words = "report.seeds=2", "hologram.depths=4"
     with monkeypatch.context() as patch:
