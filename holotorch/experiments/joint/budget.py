@@ -45,7 +45,10 @@ def joint_budget(settings: JointSettings, error_of_planes: float, padded: Callab
 
 
 def choose_planes(settings: JointSettings, slab_error: Callable[[int], float]) -> int:
-    """Number of planes: the given one, 5 without a tolerance, otherwise the fewest whose error is within the share."""
+    """Number of planes: the given one, 5 without a tolerance, otherwise the fewest whose error is within the share.
+
+    ``slab_error`` gives the error of a number of planes with one sample of the volume for each.
+    """
     given = settings.display.planes
     if given is not None or settings.tolerance is None:
         return PLANES if given is None else given

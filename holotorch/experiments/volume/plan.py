@@ -228,7 +228,7 @@ def unlit(experiment: VolumeExperiment) -> list[str]:
     clear = transfer.positions[(transfer.opacities == 0) & (transfer.positions < dense[0])]
     if not len(clear) or dense[0] - clear[-1] > _STEEP * (transfer.positions[-1] - clear[0]):
         return []
-    return ["the transfer function shows opaque surfaces, whose shape is seen with view.lighting=true"]
+    return ["the transfer function shows opaque surfaces without shading; view.lighting=true shows their shape"]
 
 
 def _other_values(experiment: VolumeExperiment) -> list[str]:

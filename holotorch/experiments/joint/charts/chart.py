@@ -82,6 +82,7 @@ QUICK = Amount(
 )
 
 
+# Rows of the table, further tables by name, PNG figures by name, and lines of the verdict.
 Chart = tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]
 
 
@@ -91,7 +92,7 @@ def joint(quick: bool = False) -> Chart:
 
 
 def drawn(amount: Amount) -> Chart:
-    """The same of a measurement of any size."""
+    """Measure the cases of ``amount``; returns the same as :func:`joint`."""
     cases = {name: CASES[name] for name in amount.cases}
     rows: list[dict[str, Any]] = []
     memory: list[dict[str, Any]] = []
