@@ -171,7 +171,9 @@ class Kills:
         for shot in shots:
             status = _exit(words, shot, place)
             _check_end(status, shot, out, place)
-            before = _check_folder(out, before, tidy=status in (0, 130))
+            # What an earlier SIGKILL has left is removed by a run that goes on, not by one that ends before.
+            tidy = status == 0 or (status == 130 and "before it went on" not in _log(place))
+            before = _check_folder(out, before, tidy=tidy)
             if status == 0 or (out / "summary.json").is_file():
                 break
             # A folder without these two holds no run yet, as the command says.
@@ -234,6 +236,7 @@ def _quick() -> Iterator[None]:
 
 def _exit(words: list[str], shot: Shot, place: Path) -> int:
     """Run a command in a child that gets the signal; its exit status, negative for the signal that has ended it."""
+    (place / "log.txt").write_bytes(b"")  # a signal may come before the child has opened it
     child = os.fork()
     if child == 0:
         _child(words, shot, place)

@@ -49,7 +49,9 @@ def evaluate(experiment: JointExperiment, shown: Shown) -> tuple[dict[str, Any],
 
 
 def errors(images: Tensor, wanted: Tensor) -> dict[str, float]:
-    """PSNR in dB over all images together, mean SSIM, and contrast of images [C, V, H, W] that are scaled as wanted.
+    """PSNR in dB over all images together, their relative L2 error, mean SSIM, and contrast.
+
+    ``images`` [C, V, H, W] are scaled as ``wanted``.
 
     The contrast is the standard deviation of shown / wanted over its mean, where the wanted image is bright. Unlike the
     PSNR it does not profit from a black background.
@@ -58,8 +60,10 @@ def errors(images: Tensor, wanted: Tensor) -> dict[str, float]:
     images, wanted = (images / peak).cpu(), (wanted / peak).cpu()
     bright = wanted > _BRIGHT
     ratio = images[bright] / wanted[bright]
+    square = (images - wanted).square().mean().item()
     return {
-        "psnr": -10 * math.log10((images - wanted).square().mean().item()),
+        "psnr": -10 * math.log10(square),
+        "error": math.sqrt(square / wanted.square().mean().item()),
         "ssim": ssim(images.clamp(0, 1), wanted, data_range=1.0).mean().item(),
         "contrast": (ratio.std() / ratio.mean()).item(),
     }

@@ -5,6 +5,7 @@ from typing import Any
 
 from holotorch.experiments.joint.budget import COARSE_PLANES, FEW_PLANES
 from holotorch.experiments.joint.names import NAMES, SETS
+from holotorch.experiments.planning.correction import HEAT, PROPAGATION
 from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
@@ -19,6 +20,7 @@ _PICTURES = {
 
 _POOR = 30.0  # dB of the corrected pictures below which a binding limit is named
 _POOR_PARTS = 25.0  # dB of the pictures through half pupils below which parts of the pupil are named
+_CLOSE = 0.5  # dB by which the error of the calculation changes a PSNR, above which both are named
 _LITTLE = 0.05  # share of the light in pupil and window below which that is said beside the scores
 
 
@@ -27,7 +29,9 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
     methods: dict[str, Any] = summary["methods"]
     corrected = methods["joint"]
     scores = [
-        f"{corrected[f'{key}_psnr']:.1f} dB {SETS[key]}" for key in ("stack", "half") if f"{key}_psnr" in corrected
+        f"{corrected[f'{key}_psnr']:.1f} dB {SETS[key]}{_exact(summary, corrected, key)}"
+        for key in ("stack", "half")
+        if f"{key}_psnr" in corrected
     ]
     others = {name: each["stack_psnr"] for name, each in methods.items() if name != "joint"}
     if others:
@@ -56,6 +60,18 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
         )
         scores[0] += f", of pictures that are {error:.0%} off the volume"
     return [*notes, f"Result     PSNR {'; '.join(scores)}", *poor, *error_line(summary)]
+
+
+def _exact(summary: dict[str, Any], scores: dict[str, Any], key: str) -> str:
+    """The PSNR that an exact calculation of the heat and of the light would give, where it is another one.
+
+    The error of the calculation is added to that of the pictures in squares, since neither knows of the other.
+    """
+    parts = [each for each in summary.get("errors", ()) if each["part"] in (HEAT, PROPAGATION)]
+    own = math.hypot(*(each["predicted"] if each["measured"] is None else each["measured"] for each in parts))
+    off = scores.get(f"{key}_error", math.inf)  # runs of before have none
+    lost = 20 * math.log10(math.hypot(1, own / off)) if off > 0 else math.inf
+    return f" ({scores[f'{key}_psnr'] - lost:.1f} dB by exact heat and light)" if _CLOSE < lost < math.inf else ""
 
 
 def joint_section(record: RunRecord) -> list[str]:
