@@ -9,6 +9,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler, RandomSamp
 from tqdm import tqdm
 
 from holotorch.correction import PECProblem
+from holotorch.experiments.runs.signals import delayed
 from holotorch.io.files import replacing
 from holotorch.io.images import load_image
 
@@ -127,5 +128,5 @@ def _save(path: Path, network: nn.Module, optimiser, schedule, losses: list[floa
         return
     state = {"network": network.state_dict(), "optimiser": optimiser.state_dict(),
              "schedule": schedule.state_dict(), "losses": losses}  # fmt: skip
-    with replacing(path) as stream:
+    with delayed(), replacing(path) as stream:
         torch.save(state, stream)

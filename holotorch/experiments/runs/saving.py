@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.fingerprint import Fingerprint, differences
+from holotorch.experiments.runs.signals import delayed
 from holotorch.io.files import replacing
 
 
@@ -74,7 +75,7 @@ class Checkpoint(_Writer):
         """Write tensors and plain values; returns False if that fails."""
         self.failure = None
         try:
-            with replacing(self.path, needed=_bytes(content)) as stream:
+            with delayed(), replacing(self.path, needed=_bytes(content)) as stream:
                 try:
                     content = content | {"fingerprint": self.fingerprint}
                     torch.save(content | {"checksum": checksum(content)}, stream)

@@ -54,6 +54,16 @@ def deferred(signals: list[int]) -> Iterator[None]:
 
 
 @contextmanager
+def delayed() -> Iterator[None]:
+    """Signals within this block take effect at its end, as while torch writes a file: an exception would abort it."""
+    signals: list[int] = []
+    with deferred(signals):
+        yield
+    if signals:
+        signal.raise_signal(signals[0])
+
+
+@contextmanager
 def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
     """Call ``handler`` for each signal within this block, with the number of the signal and the stack frame."""
     if threading.current_thread() is not threading.main_thread():

@@ -194,12 +194,13 @@ def preset_note(experiment: VolumeExperiment) -> str:
     low, high = experiment.preset_range
     transfer = experiment.transfer
     hidden = float(transfer.positions[max(0, int((transfer.opacities > 0).to(torch.uint8).argmax()) - 1)])
-    preset, least = experiment.settings.transfer.preset, float(experiment.volume.values.min())
-    lower = [f"{(least + each) / 2:.3g}" for each in (low, high, hidden)]
+    # The part of the histogram that is hidden lies between its threshold, low, and the first value that shows.
+    preset, shown = experiment.settings.transfer.preset, (low + hidden) / 2
+    lower = low - (hidden - shown) * (high - low) / (high - hidden)
     return (
         f"the preset {preset} lies between {low:.3g} and {high:.3g}, from the histogram, and shows nothing of values "
-        f"below {hidden:.3g}: look at it with holotorch check --preview; values from {lower[2]} on, for example, are "
-        f"shown by 'transfer={{preset: {preset}, low: {lower[0]}, high: {lower[1]}}}'"
+        f"below {hidden:.3g}: look at it with holotorch check --preview; values from {shown:.3g} on, for example, are "
+        f"shown by 'transfer={{preset: {preset}, low: {lower:.3g}, high: {high:.3g}}}'"
     )
 
 
