@@ -20,7 +20,8 @@ def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
     The table covers 360 to 830 nm (ValueError outside) in steps of 1 nm; values in between are interpolated by
     Sprague's method, as CIE 167 recommends.
     """
-    from colour import MSDS_CMFS, SpragueInterpolator
+    with np.printoptions():  # importing colour changes how NumPy prints numbers, which ends with this block
+        from colour import MSDS_CMFS, SpragueInterpolator
 
     table = MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     nanometres = np.array(checks.wavelengths(wavelengths)) * 1e9
@@ -31,6 +32,14 @@ def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
         raise ValueError(f"wavelength {wrong[0]:g} nm has no colour: {covered}")
     columns = [SpragueInterpolator(table.wavelengths, table.values[:, i])(nanometres) for i in range(3)]
     return torch.from_numpy(np.stack(columns).reshape(3, -1))
+
+
+def _srgb_from_xyz() -> np.ndarray:
+    """Matrix [3, 3] from X, Y and Z to linear sRGB."""
+    with np.printoptions():  # as above
+        from colour.models import RGB_COLOURSPACE_sRGB
+
+    return np.array(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB)
 
 
 def srgb_matrix(
@@ -51,8 +60,6 @@ def srgb_matrix(
         ValueError: Wavelengths outside 360 to 830 nm, weights or a white that are negative or not K numbers, or a white
             whose luminance is 0.
     """
-    from colour.models import RGB_COLOURSPACE_sRGB
-
     matching = tristimulus(wavelengths)
     count = matching.shape[1]
     power, white = (
@@ -66,7 +73,7 @@ def srgb_matrix(
     luminance = matrix[1] @ white
     if luminance <= 0:
         raise ValueError("white has no luminance; it needs a positive intensity and weight at a visible wavelength")
-    return torch.from_numpy(np.array(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB)) @ matrix / luminance
+    return torch.from_numpy(_srgb_from_xyz()) @ matrix / luminance
 
 
 def white_balance(wavelengths: Sequence[float]) -> Tensor:
@@ -75,12 +82,10 @@ def white_balance(wavelengths: Sequence[float]) -> Tensor:
     The largest power is 1. A display with these powers shows equal values of its three channels as neutral grey.
     ValueError unless there are three wavelengths, in metres, that can be mixed to D65.
     """
-    from colour.models import RGB_COLOURSPACE_sRGB
-
     matching = tristimulus(wavelengths)
     if matching.shape[1] != 3:
         raise ValueError(f"white balance needs three wavelengths, got {matching.shape[1]}")
-    white = torch.from_numpy(np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3))
+    white = torch.from_numpy(np.linalg.inv(_srgb_from_xyz()) @ np.ones(3))
     powers = torch.linalg.solve(matching, white) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
     if (powers <= 0).any():
         listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
@@ -93,11 +98,10 @@ def _even_balance(wavelengths: Sequence[float]) -> Tensor:
 
     ValueError for wavelengths that cannot be mixed to D65.
     """
-    from colour.models import RGB_COLOURSPACE_sRGB
     from scipy.optimize import nnls
 
     matching = tristimulus(wavelengths).numpy()
-    white = np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3)
+    white = np.linalg.inv(_srgb_from_xyz()) @ np.ones(3)
     # Nonnegative least squares: the colour first, and among all powers of this colour those of least variance.
     uneven = _LITTLE * (np.eye(len(wavelengths)) - 1 / len(wavelengths))
     powers, _ = nnls(np.concatenate([matching, uneven]), np.concatenate([white, np.zeros(len(wavelengths))]))

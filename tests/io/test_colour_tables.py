@@ -67,6 +67,12 @@ def test_refusals():
         white_balance([636e-9, 520e-9])
 
 
-def test_the_tables_are_read_only_when_asked_for():
-    code = "import sys, holotorch.io.colour_tables, holotorch.optics.light.spectrum; assert 'colour' not in sys.modules"
+def test_the_tables_are_read_only_when_asked_for_and_numbers_are_printed_as_before():
+    code = (
+        "import sys, numpy, holotorch.io.colour_tables as tables, holotorch.optics.light.spectrum\n"
+        "assert 'colour' not in sys.modules\n"
+        "printed = numpy.get_printoptions()\n"
+        "tables.srgb_matrix([630e-9])\n"
+        "assert 'colour' in sys.modules and numpy.get_printoptions() == printed\n"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from holotorch.io.files import write_text
 
 
@@ -14,5 +16,8 @@ def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    # A number of NumPy is written as NumPy prints it, which other libraries change; a float, always in full.
+    writer.writerows(
+        {key: value.item() if isinstance(value, np.generic) else value for key, value in row.items()} for row in rows
+    )
     write_text(path, text.getvalue())
