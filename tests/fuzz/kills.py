@@ -346,6 +346,8 @@ def _check_folder(out: Path, before: dict[str, Any], *, tidy: bool) -> dict[str,
         status = now["summary.json"]["status"]
         if status != "complete":
             raise Failed(f"summary.json says {status}")
+    if "config.yaml" not in before:  # no run had begun, and a new one writes it anew
+        gone -= {"env.json"}
     if gone:
         raise Failed(f"{', '.join(sorted(gone))} is gone")
     if "checkpoint.pt" in before and "checkpoint.pt" in now:

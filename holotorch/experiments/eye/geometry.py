@@ -22,6 +22,7 @@ _REGIONS = (  # meanings of the regions
     "the cone of light covers the whole hologram, so spots grow with distance",
 )
 _INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller fraction of its light enters the pupil
+_NEAREST = 1e3 / 11  # mm; eyes of 20 years accommodate by 11 dioptres, and older ones by fewer (Duane 1912)
 _LITTLE = 0.01  # share of the light of the scene's centre in the pupil below which pictures are dim
 
 
@@ -114,6 +115,12 @@ def warnings(values: dict[str, Any]) -> list[str]:
         lines.append(
             f"only {100 * least:.2g} % of the light of the scene's centre enters the pupil: pictures are dim (below "
             f"{100 * _LITTLE:g} %); enlarge eye.pupil_radius, or move eye or lens"
+        )
+    if 0 < (nearest := min(each or math.inf for each in values["accommodation_mm"])) < _NEAREST:
+        lines.append(
+            f"the scene appears {nearest:.3g} mm from the eye ({1e3 / nearest:.2g} dioptres), nearer than eyes focus: "
+            "11 dioptres at the age of 20, 4 at 45; the simulated eye can; the distances and focal "
+            "length in display say where the scene appears"
         )
     return lines
 

@@ -13,7 +13,7 @@ from holotorch.experiments.joint.seconds import seconds_of, step_views, view_sam
 from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise, response_note
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
-from holotorch.experiments.volume.plan import cut_off, dark_picture, preset_note, viewpoint
+from holotorch.experiments.volume.plan import cut_off, dark_picture, preset_note, unlit, viewpoint
 from holotorch.optics.light.coherence import depth_of_focus
 
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
@@ -147,7 +147,7 @@ def _far_apart(experiment: JointExperiment, step: float, focus: float) -> str:
 
 def _notes(experiment: JointExperiment) -> list[str]:
     settings, foci = experiment.settings, experiment.foci
-    notes = dark_picture(experiment.scene) + cut_off(experiment.scene, "array")
+    notes = dark_picture(experiment.scene) + cut_off(experiment.scene, "array") + unlit(experiment.scene)
     if words := preset_note(experiment.scene):
         notes.append(words)
     if (error := experiment.budget.error(SLABS)) > FEW_PLANES:

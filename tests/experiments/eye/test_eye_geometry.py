@@ -44,6 +44,7 @@ def test_the_thesis_display_has_the_thesis_numbers():
     words = " ".join(in_words(values))
     assert "9.76 deg" in words and "beyond infinity" in words and "centre I, edge II" in words
     assert "WARNING    the edge of the scene is invisible to this eye; enlarge eye.pupil_radius" in words
+    assert "WARNING    the scene appears 71.2 mm from the eye (14 dioptres), nearer than eyes focus" in words
     assert "0 % of the light of the edge enters the pupil, and below 0.5 % it counts as invisible" in words
 
 

@@ -54,6 +54,13 @@ def test_too_few_samples_of_a_volume_are_noted(planes, shown):
     assert parts(sampled.values)["planes"]["predicted_error"] < 0.05 and "off this volume" not in sampled.text
 
 
+def test_opaque_surfaces_without_shading_are_noted():
+    noted = [
+        "opaque surfaces" in check(settings("transfer=skin", *light)).text for light in ([], ["view.lighting=true"])
+    ]
+    assert noted == [True, False]
+
+
 def test_planes_far_apart_are_noted_with_a_number_that_is_not():
     """520 nm, sine 0.0202: a depth of focus of 1.27 mm; planes 2.5 mm apart."""
     (note,) = [
