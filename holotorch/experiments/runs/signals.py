@@ -1,10 +1,13 @@
 """Handling of Ctrl-C, SIGTERM and SIGHUP, which end the computation of a run but not the saving of its results."""
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+_AGAIN = 0.01  # seconds after which a signal comes again whose exception Python has dropped
 
 
 class Signals(list[int]):
@@ -21,7 +24,8 @@ def interruptible() -> Iterator[Signals]:
     """Treat SIGTERM and SIGHUP (a closed terminal) like Ctrl-C within this block, and record the signals in a list.
 
     Only the first signal raises KeyboardInterrupt, and only before the list is ``settled``; a second signal does not
-    interrupt saving. A nested block shares the list of the outer block, and raises KeyboardInterrupt at its start if a
+    interrupt saving. Where Python drops the exception, as in callbacks of weak references, the signal comes again a
+    moment later. A nested block shares the list of the outer block, and raises KeyboardInterrupt at its start if a
     signal has been received before.
     """
     global _current
@@ -38,12 +42,19 @@ def interruptible() -> Iterator[Signals]:
         if len(signals) == 1 and not signals.settled:
             raise KeyboardInterrupt
 
-    _current = signals
+    def again(dropped: "sys.UnraisableHookArgs") -> None:
+        if signals and issubclass(dropped.exc_type, KeyboardInterrupt):
+            threading.Timer(_AGAIN, signal.raise_signal, (signals.pop(),)).start()
+        else:
+            hook(dropped)
+
+    _current, hook = signals, sys.unraisablehook
     try:
+        sys.unraisablehook = again
         with handling(note):
             yield signals
     finally:
-        _current = outer
+        _current, sys.unraisablehook = outer, hook
 
 
 @contextmanager

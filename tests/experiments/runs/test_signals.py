@@ -1,6 +1,8 @@
-"""Signals while a checkpoint is written."""
+"""Signals while a checkpoint is written, and those that Python drops."""
 
 import signal
+import sys
+import time
 
 import pytest
 import torch
@@ -28,3 +30,33 @@ def test_a_signal_while_torch_writes_takes_effect_when_the_file_is_whole(number,
     content = checkpoint.load()
     assert content and content["step"] == 3 and torch.equal(content["x"], torch.ones(5))
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+class Gone:
+    """Python drops exceptions that are raised while it removes an object."""
+
+    def __init__(self, error: type[BaseException] | None):
+        self.error = error
+
+    def __del__(self):
+        if self.error:
+            raise self.error
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_signal_that_python_drops_comes_again():
+    with interruptible() as signals, pytest.raises(KeyboardInterrupt):
+        Gone(None)
+        end = time.monotonic() + 20
+        while time.monotonic() < end:
+            time.sleep(0.01)
+    assert signals == [signal.SIGTERM]
+
+
+def test_other_dropped_exceptions_are_reported_as_before(monkeypatch):
+    dropped = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda args: dropped.append(args.exc_type))
+    before = sys.unraisablehook
+    with interruptible() as signals:
+        Gone(ValueError)
+    assert dropped == [ValueError] and not signals and sys.unraisablehook is before
