@@ -70,22 +70,28 @@ def _run(options: argparse.Namespace) -> int:
 
     settings = load_config(options.config, options.overrides)  # reports mistakes before torch is loaded
     from holotorch.experiments.execute import execute
+    from holotorch.experiments.planning.threads import undisturbed
 
     name = run_name(options.config, options.overrides, settings.experiment)
-    return _finish(*execute(settings, options.out, name))
+    with undisturbed():
+        return _finish(*execute(settings, options.out, name))
 
 
 def _resume(options: argparse.Namespace) -> int:
     from holotorch.experiments.execute import resume
+    from holotorch.experiments.planning.threads import undisturbed
 
-    return _finish(*resume(options.folder))
+    with undisturbed(resumed=options.folder):
+        return _finish(*resume(options.folder))
 
 
 def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.demo import demo
+    from holotorch.experiments.planning.threads import undisturbed
     from holotorch.experiments.streaming.screenshot import screenshot
 
-    return _finish(*demo(options.out, screenshot))
+    with undisturbed():
+        return _finish(*demo(options.out, screenshot))
 
 
 def _finish(folder: Path, complete: bool) -> int:
@@ -101,8 +107,10 @@ def _check(options: argparse.Namespace) -> int:
 
     settings = load_config(options.config, options.overrides)
     from holotorch.experiments.execute import check, emphasised
+    from holotorch.experiments.planning.threads import undisturbed
 
-    plan = check(settings)
+    with undisturbed():
+        plan = check(settings)
     print(emphasised(plan.text))
     if options.preview is not None:
         from holotorch.experiments.execute import write_preview
