@@ -36,7 +36,7 @@ def test_check_computes_and_writes_nothing(capsys, tmp_path):
     assert main(["check", CONFIG, "propagator={kind: fresnel, distance: 100 mm}"]) == 0
     out = capsys.readouterr().out
     assert "Planned    one propagation over this distance: cropped kernel on 256 x 256 samples is the cheapest" in out
-    assert "exact kernel on twice the window" in out and "field of view" in out and "GB of memory" in out
+    assert "paraxial kernel on twice the window" in out and "field of view" in out and "GB of memory" in out
     assert not list(tmp_path.iterdir())
 
 

@@ -115,7 +115,8 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         lines.append(
             f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot of each colour"
             f"{', at the farthest,' if len(physics['distance_mm']) > 1 else ''} {_listed(physics['spot_um'])} um, "
-            f"sampled every {physics['pitch_um'][1]:.4g} um{'' if experiment.isolated else periodic}"
+            f"sampled every {physics['pitch_um'][1]:.4g} um, which the array resolves up to "
+            f"{physics['resolved_mm']:.3g} mm{'' if experiment.isolated else periodic}"
         )
     if planned := values.get("single_propagation"):
         lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
@@ -141,7 +142,9 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         f"{duration(values['predicted_seconds'])} ({seconds_in_words(values['seconds_of'])}), "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
-    lines += [f"Note       {note}" for note in values["notes"]]
+    for note in values["notes"]:
+        warning = note.removeprefix(_WARNING)
+        lines.append(f"Note       {note}" if warning == note else f"WARNING    {warning}")
     return "\n".join(lines)
 
 
@@ -172,6 +175,7 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
 # Limit in the far field, over the root of the kernel's sum, below which pictures are lost: for sigmas of 0.66 to 2 px,
 # SSIM of four joint frames at 64 px is 0.16 to 0.86 at 0.6 to 3.6, 0.79 to 1.0 at 4.05 to 4.5, and from 0.92 at 5.3.
 _FAR_FIELD = 4.0
+_WARNING = "Warning: "  # beginning of a note without which pictures cannot be understood
 _SAME_ASPECT = 0.01  # relative change of an aspect ratio that nobody sees
 _LITTLE = 1.0  # rad: of random phases that differ by less, over 0.9 of the light goes straight on (sinc^2(1/2))
 _FEW_SPOTS = 0.1  # width of a spot, relative to the array, from which on hardly ten of them lie side by side
@@ -238,7 +242,8 @@ def _heat(experiment: PECExperiment) -> str:
 
 def _padding_reason(experiment: PECExperiment) -> str:
     if experiment.isolated:
-        return "a chip that stands alone: its exact kernel on twice the window, so that no light wraps around"
+        kernel = "paraxial" if experiment.settings.propagator.kind == "fresnel" else "exact"
+        return f"a chip that stands alone: its {kernel} kernel on twice the window, so that no light wraps around"
     if experiment.distances:
         return "unpadded: the periodic model of the thesis"
     return "unpadded: the far field of the array, sampled once per pixel"
@@ -281,7 +286,7 @@ def _notes(experiment: PECExperiment) -> list[str]:
             nearer = farthest * max(grid.pitch) / spot
             if (share := spot / min(grid.extent)) > _FEW_SPOTS:
                 notes.append(
-                    f"Warning: at {farthest * 1e3:.4g} mm a spot is {share:.2g} times as wide as the array, which "
+                    f"{_WARNING}at {farthest * 1e3:.4g} mm a spot is {share:.2g} times as wide as the array, which "
                     "forms no picture there"
                 )
             notes.append(
@@ -326,6 +331,7 @@ def _physics(experiment: PECExperiment) -> dict[str, Any]:
         values |= {
             "distance_mm": [distance * 1e3 for distance in distances],
             "spot_um": [wavelength * max(map(abs, distances)) / min(grid.extent) * 1e6 for wavelength in wavelengths],
+            "resolved_mm": max(grid.pitch) * min(grid.extent) / max(wavelengths) * 1e3,
             "alias_free_mm": [unaliased_distance(grid, wavelength, 1) * 1e3 for wavelength in wavelengths],
         }
     return values

@@ -21,6 +21,8 @@ ISOLATED_NAME = "Corrected, on a chip that stands alone"
 BETWEEN_NAME = "Corrected, midway between the samples"
 _PICTURES = {"target": "Target", **METHOD_NAMES, "between": BETWEEN_NAME, "isolated": ISOLATED_NAME}
 _MELTING = 1390.0  # K above ambient at which silicon melts (1414 degC)
+_HOTTER = 1.1  # ratio of temperatures above which that without correction is named
+_OTHER = {"ssim": 5e-3, "psnr": 0.5}  # differences of scores above which both are named
 _POOR = 0.8  # SSIM of a corrected picture below which more frames are advised
 _FIGURES = {
     "phase": "Heater phases, before the heat spreads{frame}",
@@ -37,10 +39,14 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
     scores = []
     for key, name, digits, unit in (("ssim", "SSIM", 3, ""), ("psnr", "PSNR", 1, " dB")):
         if (value := corrected.get(f"{key}_mean")) is not None:
-            without = _fixed(before.get(f"{key}_mean"), digits)
-            scores.append(
-                f"{name} {_fixed(value, digits)}{unit}" + (f" ({without} without correction)" if without else "")
-            )
+            others = []
+            if without := _fixed(before.get(f"{key}_mean"), digits):
+                others.append(f"{without} without correction{_unlike(corrected, before)}")
+            # Scored by exact light, where the run is paraxial or repeats the chip without end.
+            alone = corrected.get("isolated", {}).get(f"{key}_mean")
+            if alone is not None and abs(alone - value) > _OTHER[key]:
+                others.append(f"{_fixed(alone, digits)} of the chip alone by exact light")
+            scores.append(f"{name} {_fixed(value, digits)}{unit}" + (f" ({'; '.join(others)})" if others else ""))
     if (between := corrected.get("between_samples", {}).get("ssim_mean")) is not None:
         scores.append(
             f"SSIM {_fixed(between, 3)} midway between the samples (between.png), which a viewer sees as well"
@@ -60,6 +66,13 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
             "nearer picture come closer"
         )
     return [f"Result     {', '.join(scores)}", *kernel, *advice, *error_line(summary)]
+
+
+def _unlike(corrected: dict[str, Any], before: dict[str, Any]) -> str:
+    """What else differs between the picture without correction and the corrected one, in words."""
+    frames = ", in one frame" if before.get("frames") == 1 < corrected["frames"] else ""
+    hottest, limited = (max(each["peak_temperature_rise_K"]) for each in (before, corrected))
+    return frames + (f", at {hottest:.0f} degC" if hottest > _HOTTER * limited else "")
 
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:

@@ -8,7 +8,9 @@ from torch import Tensor
 
 NOISY = 2e-4  # noise of a kernel above which it is stated; a thousandth costs little (correct_my_chip.md)
 _WARM = 0.02  # mean rise along a side, relative to the centre, above which heat is missing
+_MISSING = 0.01  # heat beyond the table, relative to that within, above which it is said
 _FAINT = 1e-3  # rise beyond the table, relative to the centre, below which it is left out
+_WIDEST = 401  # taps of a table that is continued, at most
 _LEAST = 1e-6  # rise of a tap, relative to the centre, whose logarithm is taken for a smaller one
 
 
@@ -30,16 +32,24 @@ def warm_ring(kernel: Tensor) -> float:
 
 def is_cut_off(kernel: Tensor) -> bool:
     """Whether much heat spreads beyond the table of a measured kernel."""
-    return warm_ring(kernel) > _WARM
+    return warm_ring(kernel) > _WARM or heat_beyond(kernel) > _MISSING
+
+
+def heat_beyond(kernel: Tensor) -> float:
+    """Heat beyond a table, relative to that within, if it falls on as in :func:`continued`; 0 where that is unknown."""
+    whole = continued(kernel / kernel.max(), (_WIDEST, _WIDEST))
+    return 0.0 if whole is None else float(whole.sum() / kernel.double().sum() * kernel.max()) - 1
 
 
 def cut_off_note(kernel: Tensor) -> list[str]:
     """A note on a measured kernel whose table ends where it is still warm; empty for another."""
     if not is_cut_off(kernel):
         return []
+    beyond = heat_beyond(kernel)
+    about = f", some {beyond:.1%} of that within," if beyond > _MISSING else ""
     return [
-        f"the measured kernel is cut off where the rise is still {warm_ring(kernel):.1%} of that of its centre: the "
-        "heat beyond is not in the model; give more rows and columns, or subtract what is not heat"
+        f"the measured kernel is cut off where the rise is still {warm_ring(kernel):.1%} of that of its centre: "
+        f"the heat beyond{about} is not in the model; give more rows and columns, or subtract what is not heat"
     ]
 
 

@@ -20,6 +20,8 @@ from holotorch.tracking.camera.calibration import PARAMETERS, Calibration
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.alignment import Alignment
 from holotorch.tracking.pose.catheter import NO_GAPS, Catheter
+from holotorch.tracking.pose.pose import solve_pose
+from holotorch.tracking.pose.status import Pose
 
 
 def _tone(value: Any) -> Any:
@@ -39,6 +41,7 @@ def _colour(value: Any) -> Any:
     return value
 
 
+_INTRINSICS = "fx", "fy", "cx", "cy"
 Positive = Annotated[Number, Field(gt=0)]
 Level = Annotated[int, BeforeValidator(number), Field(ge=0, le=255)]
 Colour = Annotated[tuple[Level, Level, Level], BeforeValidator(_colour)]
@@ -113,6 +116,25 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 def load_camera(path: Path | str, overrides: Sequence[str] = ()) -> CameraSettings:
     """Read a camera's file, apply overrides and check it. ConfigError gives file, line and column of mistakes."""
     return _load(CameraSettings, build_camera, path, overrides)
+
+
+def calibration_sd(settings: CameraSettings, catheter: Catheter, pose: Pose) -> float | None:
+    """Standard deviation in metres that the camera's calibration adds to the tip of a pose; None without one.
+
+    The tip of the same edges is solved with each of fx, fy, cx and cy changed by its deviation, and the displacements
+    are added in squares. Those of the distortion are left out: they make up for one another between the boards.
+    """
+    if settings.calibration is None:
+        return None
+    edges = build_camera(settings).project(pose.tip + catheter.positions[:, None] * pose.direction)
+    others = [
+        build_camera(settings.model_copy(update={name: getattr(settings, name) + deviation}))
+        for name in _INTRINSICS
+        if (deviation := settings.calibration.deviations.get(name, 0.0))
+    ]
+    tips = [solve_pose(edges[None], catheter.positions, camera).tip[0] for camera in others]
+    moved = [tip - pose.tip for tip in tips if bool(tip.isfinite().all())]
+    return float(torch.stack(moved).norm()) if moved else None
 
 
 def load_catheter(path: Path | str, overrides: Sequence[str] = ()) -> CatheterSettings:

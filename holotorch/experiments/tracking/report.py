@@ -78,6 +78,7 @@ class Log:
     seconds: list[float] = field(default_factory=list)  # time of the tracker for each frame that could be read
     stages: list[dict[str, float]] = field(default_factory=list)  # seconds of each stage of the tracker, by frame
     pictures: dict[str, str] = field(default_factory=dict)  # captions of the overlays by status
+    first: Pose | None = None  # the first of all
     beyond: int = 0  # frames in which the tube goes on beyond the tip of the pose
     # Refused frames and the first of them, by status and reason without its numbers.
     refused: dict[tuple[str, str], tuple[int, str]] = field(default_factory=dict)
@@ -93,6 +94,8 @@ class Log:
             smaller = avg_pool2d(drawn.double() / 255, max(1, min(drawn.shape[-2:]) // 400))
             save_picture(self.images / item.status.name, smaller)
             self.pictures[item.status.name] = _caption(item)
+        if pose.answered and self.first is None:
+            self.first = pose
         if not pose.answered:
             kind = item.status.name, re.sub(r"\d+(\.\d+)?", "#", pose.reason)
             count, first = self.refused.get(kind, (0, _caption(item)))
@@ -189,6 +192,16 @@ def verdict(summary: dict[str, Any]) -> str:
     return text
 
 
+def camera_line(summary: dict[str, Any]) -> list[str]:
+    """What the calibration of the camera adds to the stated deviations, as a line to print; none where unknown."""
+    if (added := summary.get("calibration_sd_mm")) is None or "tip_sd_mm" not in summary:
+        return []
+    return [
+        f"Camera     its calibration adds about {added:.2g} mm (sd) to the tips, alike in all frames, to the "
+        f"{summary['tip_sd_mm']['median']:.2g} mm that the frames leave open (sd in overlay and poses.csv)"
+    ]
+
+
 def refusals(summary: dict[str, Any]) -> list[str]:
     """The common refusals and what to look at, if one frame in fifty or more has no pose."""
     refused = summary.get("refused")  # none in runs of before
@@ -221,6 +234,7 @@ def track_section(record: RunRecord) -> list[str]:
     text = f"{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
     text += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
     parts.append(element("p", text + f"Deviations (sd) are the tracker's own estimate: {_STATED}, which adds to them."))
+    parts += [element("p", f"{words.removeprefix('Camera').strip()}.") for words in camera_line(summary)]
     parts += [_truth(summary["truth"])] if "truth" in summary else []
     parts += [element("p", f"Note: {note}.") for note in summary["notes"]]
     parts.append(table(["status", "frames"], [[name, str(count)] for name, count in summary["statuses"].items()]))

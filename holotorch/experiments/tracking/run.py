@@ -23,7 +23,13 @@ from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.timing import timed
 from holotorch.experiments.tracking.config import FRAMES, SYNTHETIC, TrackSettings
-from holotorch.experiments.tracking.devices import build_headset, headset_covariance, load_headset
+from holotorch.experiments.tracking.devices import (
+    build_headset,
+    calibration_sd,
+    headset_covariance,
+    load_camera,
+    load_headset,
+)
 from holotorch.experiments.tracking.forecast import range_text
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
 from holotorch.experiments.tracking.source import Tracker, TrackingInputs, fitting_tracker, open_inputs
@@ -244,6 +250,9 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
                 raise failure
             return False
         summary = summarise(log, frames, settings.method, settings.still)
+        if log.first is not None and "camera.yaml" in inputs.paths:
+            added = calibration_sd(load_camera(folder / "camera.yaml"), inputs.catheter, log.first)
+            summary["calibration_sd_mm"] = None if added is None else 1e3 * added
         if comparison := errors(folder / "poses.csv", experiment.truth):
             summary["truth"] = comparison
         if failure is not None:

@@ -36,6 +36,7 @@ def overlay(pixels: Tensor, pose: Pose, camera: Camera, catheter: Catheter) -> T
         _draw_catheter(canvas, pose, camera, catheter, colour, unit)
         x, y, z = (1e3 * pose.tip.detach()).tolist()
         headline = f"{pose.status.name}: tip {x:.1f} {y:.1f} {z:.1f} mm, sd {1e3 * float(pose.tip_sd.detach()):.2f} mm"
+        headline += " + calibration"
     else:
         headline = f"{pose.status.name}: no pose ({pose.status.stage})"
     _draw_text(canvas, [headline, pose.reason], colour, unit)

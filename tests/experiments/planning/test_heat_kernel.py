@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.experiments.planning.heat_kernel import continued, cut_off_note, is_cut_off, response_note
+from holotorch.experiments.planning.heat_kernel import (
+    continued,
+    cut_off_note,
+    heat_beyond,
+    is_cut_off,
+    response_note,
+)
 
 
 def rises(height: int, width: int, length: float = 2.0) -> torch.Tensor:
@@ -31,10 +37,13 @@ def test_a_kernel_that_does_not_fall_is_not_continued():
     assert continued(rises(3, 3), (32, 32)) is None  # two rings are the whole table
 
 
-@pytest.mark.parametrize(("length", "cut"), [(0.7, False), (1.5, True)])
+@pytest.mark.parametrize(("length", "cut"), [(0.5, False), (0.7, True), (1.5, True)])
 def test_a_table_that_ends_while_it_is_warm_is_noted(length, cut):
     kernel = rises(7, 7, length)
     assert is_cut_off(kernel) == cut == bool(cut_off_note(kernel))
+    beyond = float(rises(401, 401, length).sum() / kernel.sum()) - 1
+    assert heat_beyond(kernel) == pytest.approx(beyond, rel=0.1, abs=2e-3)  # without what is below a thousandth
+    assert not cut or f"some {heat_beyond(kernel):.1%} of that within" in cut_off_note(kernel)[0]
 
 
 def test_a_phase_per_kelvin_without_its_wavelength_is_noted_where_there_is_no_light_of_630_nm():
