@@ -88,7 +88,7 @@ def load_volume(
     unit = unit or "m"
     # The origin is meaningful only in the unit of the spacing.
     origin = scan.origin if scan.spacing is not None and scan.unit == unit else (0.0, 0.0, 0.0)
-    return Volume(_tensor(scan.values, file), steps, unit, origin, scan.orientation)  # type: ignore[arg-type]
+    return Volume(_tensor(scan.values, file), steps, unit, origin, scan.orientation, scan.frame)  # type: ignore[arg-type]
 
 
 def _as_stated(file: Path, scan: Scan, unit: str | None) -> Volume:
@@ -97,7 +97,9 @@ def _as_stated(file: Path, scan: Scan, unit: str | None) -> Volume:
     if scan.spacing is None or not all(np.isfinite(scan.spacing)) or min(scan.spacing) <= 0:
         hint = "such as (1e-3, 5e-4, 5e-4), or spacing=1, unit='relative' for cubic voxels of unknown size"
         raise ValueError(f"{file} does not state the spacing of its voxels: pass spacing=(z, y, x) in metres, {hint}")
-    return Volume(_tensor(scan.values, file), triple(scan.spacing), scan.unit, scan.origin, scan.orientation)
+    return Volume(
+        _tensor(scan.values, file), triple(scan.spacing), scan.unit, scan.origin, scan.orientation, scan.frame
+    )
 
 
 def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:

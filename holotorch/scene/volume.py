@@ -26,6 +26,9 @@ class Volume:
         origin: Position (z, y, x) of sample [0, 0, 0] in the coordinates of the file, in ``unit``.
         orientation: Three unit vectors, along the axes z, y and x of ``values``, each with components (z, y, x) in the
             coordinates of the file.
+        frame: Where x, y and z of the file point, a letter for each: to a patient's L(eft) or R(ight), A (front) or P
+            (back), S (head) or I (feet), such as "LPS"; "xyz" if that has no names; empty if the file states no
+            directions.
 
     Raises:
         TypeError: ``values`` is not a real tensor, or a spacing is not a number.
@@ -38,6 +41,7 @@ class Volume:
     unit: str
     origin: Triple = (0.0, 0.0, 0.0)
     orientation: tuple[Triple, Triple, Triple] = IDENTITY
+    frame: str = ""
 
     def __post_init__(self) -> None:
         values = self.values
@@ -87,7 +91,7 @@ class Volume:
         last = (self.shape[2] - 1) * self.spacing[2]
         origin = self.origin[0] + last * a, self.origin[1] + last * b, self.origin[2] + last * c
         values = torch.from_numpy(self.values.numpy(force=True)[..., ::-1].copy())  # torch flips no uint16
-        return Volume(values.to(self.values.device), self.spacing, self.unit, origin, (z, y, (-a, -b, -c)))
+        return Volume(values.to(self.values.device), self.spacing, self.unit, origin, (z, y, (-a, -b, -c)), self.frame)
 
     def value_range(self) -> tuple[float, float]:
         """Smallest and largest value; ValueError if a value is NaN or infinite."""

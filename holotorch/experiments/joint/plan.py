@@ -19,6 +19,7 @@ from holotorch.optics.light.coherence import depth_of_focus
 _SAMPLE_BYTES = 55  # bytes per padded sample of a view of a frame and colour, kept for the gradient
 _KERNEL_BYTES = 8  # bytes per padded sample of a view of a colour, of the transfer functions of all views
 _BASE_BYTES = 430e6  # memory of the libraries
+_STRETCHED = 0.1  # logarithm of a stretch above which it is noted
 _SPACING = 0.75  # of planes, in depths of focus, above which foci between them are worse (10 dB at 0.94)
 
 
@@ -59,9 +60,6 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     source = settings.volume.path or settings.volume.scene or settings.volume.phantom
     if volume["synthetic"]:
         source = f"{settings.volume.phantom} (synthetic: {volume['synthetic']})"
-    stretched = ""
-    if display.depth is not None:
-        stretched = f", stretched {values['stretched']:.3g} times along the axis to fill display.depth"
     heat = settings.heat
     spread = f"heat spreads over {display.sigma_px:g} px"
     if display.kernel is not None:
@@ -79,7 +77,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {experiment.scene.width * 1e3:.3g} mm "
         f"wide, on {len(values['planes_mm'])} planes from "
         f"{values['planes_mm'][0]:.4g} to {values['planes_mm'][-1]:.4g} mm behind the array, its "
-        f"front nearest{stretched}, {experiment.scene.samples} sample(s) of the volume for each",
+        f"front nearest, {experiment.scene.samples} sample(s) of the volume for each",
         f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
         f"frame(s) in turn; {spread}, phases up to "
@@ -155,6 +153,12 @@ def _notes(experiment: JointExperiment) -> list[str]:
         notes.append(
             f"the rendering is {error:.0%} off this volume: pictures show {shown}; without view.samples, slabs are "
             "sampled as often as needed"
+        )
+    depth, stretched = settings.display.depth, experiment.stretched
+    if depth is not None and abs(math.log(stretched)) > _STRETCHED:
+        notes.append(
+            f"the volume is stretched {stretched:.3g} times along the axis to fill display.depth, so that an eye sees "
+            f"depth in it; display.depth={depth / stretched * 1e3:.3g}mm keeps its proportions"
         )
     notes += response_note(settings.display.model_fields_set, "display", settings.wavelengths)
     if settings.display.kernel is not None:

@@ -62,7 +62,7 @@ class VolumeSource(Settings):
     phantom: Phantom | None = None
     samples: Annotated[Count, Field(ge=4, le=512)] = 128  # samples of a phantom per axis; 512 take some seconds
     directory: str | None = None
-    spacing: Annotated[tuple[Number, ...], BeforeValidator(several)] | None = None
+    spacing: Annotated[tuple[Length, ...], BeforeValidator(several)] | None = None
     shape: tuple[Count, Count, Count] | None = None
     dtype: Annotated[str, BeforeValidator(_number_type)] | None = None
     unit: Literal["m", "relative"] | None = None

@@ -28,6 +28,8 @@ _RAY_BYTES = 120  # memory of the renderer per ray
 _FEW_VALUES = 0.01  # share of the range of a volume below which points hardly lie among its values
 _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
 _DENSE, _STEEP = 0.5, 0.1  # opacity of a surface, and the part of the range of values within which it rises to that
+_SIDES = {"L": "left", "R": "right", "A": "front", "P": "back", "S": "head", "I": "feet"}  # of a patient
+_OPPOSITE = str.maketrans("LRAPSI", "RLPAIS")
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
 _LIT = 0.05  # value above which a ray is not black
@@ -119,14 +121,20 @@ def viewpoint(experiment: VolumeExperiment) -> str:
     for direction in (observer * scene[0], -scene[1], scene[2]):
         k = int(direction.abs().argmax())
         about = "about " if direction[k].abs() < 0.99 else ""
-        names.append(f"{about}{'-' if direction[k] < 0 else ''}{'zyx'[k]}")
+        reverse = bool(direction[k] < 0)
+        names.append(f"{about}{'-' * reverse}{'zyx'[k]}{_side(experiment.volume.frame, k, reverse=reverse)}")
     text = "from {} in the coordinates of its file, with {} up and {} to the right".format(*names)
-    z, y, x = experiment.volume.orientation
-    plain = (z, y) == ((1, 0, 0), (0, 1, 0)) and abs(x[2]) == 1  # as of a file that states no directions
     source = experiment.settings.volume
-    if plain and source.path and not source.left_handed:
-        text += "; if the file does not say how its axes lie, left and right are a guess (volume.left_handed)"
+    if source.path and not experiment.volume.frame and not source.left_handed:
+        text += "; the file does not say how its axes lie: left and right are a guess (volume.left_handed)"
     return text
+
+
+def _side(frame: str, axis: int, *, reverse: bool) -> str:
+    """The side of a patient that an axis of the file (0 for z, 1 for y, 2 for x) points to, in brackets if known."""
+    letter = frame[2 - axis] if frame else ""
+    name = _SIDES.get(letter.translate(_OPPOSITE) if reverse else letter, "")
+    return f" ({name})" if name else ""
 
 
 def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:

@@ -32,7 +32,7 @@ def read_nifti(path: Path) -> Scan:
         # nibabel returns scaled values as float64; float32 is precise enough for scaled integers.
         values = values.astype(np.float32)
     values = three_axes(values.T, path)
-    return placed(values, matrix[:3, :3].T, matrix[:3, 3], "m", metres(unit, path))
+    return placed(values, matrix[:3, :3].T, matrix[:3, 3], "m", metres(unit, path), "RAS")
 
 
 def is_dicom(path: Path) -> bool:
@@ -100,7 +100,7 @@ def read_dicom(folder: Path) -> Scan:
     if first.spacing is None or step is None:
         return Scan(values)
     axes = [first.cosines[0] * first.spacing[1], first.cosines[1] * first.spacing[0], step]
-    return placed(values, axes, first.position, "m", 1e-3)
+    return placed(values, axes, first.position, "m", 1e-3, "LPS")
 
 
 def _one_series(slices: Sequence[_Slice], folder: Path) -> None:

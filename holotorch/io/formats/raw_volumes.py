@@ -18,6 +18,11 @@ _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
     "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
 }  # fmt: skip
+# Frames of NRRD's spaces; x of a left-handed one is reversed when it is read.
+_NRRD_FRAMES = {
+    **dict.fromkeys(("left-posterior-superior", "lps"), "LPS"),
+    **dict.fromkeys(("right-anterior-superior", "ras", "left-anterior-superior", "las"), "RAS"),
+}
 _NRRD_TYPES = {
     "i1": ("signed char", "int8", "int8_t"),
     "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
@@ -80,10 +85,12 @@ def read_metaimage(path: Path) -> Scan:
     if not {"ElementSpacing", "ElementSize"} & fields.keys():
         return Scan(values)
     spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path)
-    rows = _numbers(fields, ("TransformMatrix", "Orientation", "Rotation"), 9, path, default="1 0 0 0 1 0 0 0 1")
+    names = "TransformMatrix", "Orientation", "Rotation"
+    rows = _numbers(fields, names, 9, path, default="1 0 0 0 1 0 0 0 1")
+    frame = "LPS" if fields.keys() & set(names) else ""  # as ITK, which defines the format, understands it
     origin = _numbers(fields, ("Offset", "Position", "Origin"), 3, path, default="0 0 0")
     axes = np.reshape(rows, (3, 3)) * np.reshape(spacing, (3, 1))
-    return scan.placed(values, axes, origin, "m", scan.metres(fields.get("DistanceUnits", "mm"), path))
+    return scan.placed(values, axes, origin, "m", scan.metres(fields.get("DistanceUnits", "mm"), path), frame)
 
 
 def read_nrrd(path: Path) -> Scan:
@@ -156,9 +163,11 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     scale = np.array([scan.metres(unit, path) for unit in units] if units else [1.0, 1, 1])
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
-    if header.get("space", "").lower() in ("left-anterior-superior", "las", "3d-left-handed"):
+    space = header.get("space", "").lower()
+    frame = _NRRD_FRAMES.get(space, "xyz") if in_space else ""
+    if space in ("left-anterior-superior", "las", "3d-left-handed"):
         axes, origin = axes * (-1.0, 1, 1), origin * (-1.0, 1, 1)
-    return scan.placed(values, axes * scale, origin, "m" if units else "relative")
+    return scan.placed(values, axes * scale, origin, "m" if units else "relative", frame=frame)
 
 
 def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:

@@ -33,6 +33,7 @@ class Scan:
     origin: Triple = (0.0, 0.0, 0.0)  # position (z, y, x) of voxel [0, 0, 0] in ``unit``
     # Three unit vectors, along the axes z, y and x of ``values``, each with components (z, y, x).
     orientation: tuple[Triple, Triple, Triple] = IDENTITY
+    frame: str = ""  # where x, y and z of the file point; see :class:`~holotorch.scene.volume.Volume`
 
 
 def metres(unit: str, path: Path) -> float:
@@ -44,7 +45,7 @@ def metres(unit: str, path: Path) -> float:
     return length
 
 
-def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
+def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0, frame: str = "") -> Scan:
     """Scan of ``values`` [D, H, W] with a geometry whose axes and components are in the order (x, y, z).
 
     Row i of ``axes`` [3, 3] is the vector from one voxel to the next along axis i. ``origin`` is the position of the
@@ -57,7 +58,7 @@ def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float =
         return Scan(values)
     z, y, x = (triple(row) for row in steps / lengths[:, None])
     first = triple(np.asarray(origin, dtype=np.float64)[::-1] * scale)
-    return Scan(values, triple(lengths * scale), unit, first, (z, y, x))
+    return Scan(values, triple(lengths * scale), unit, first, (z, y, x), frame)
 
 
 def triple(values: Sequence[float] | np.ndarray) -> Triple:

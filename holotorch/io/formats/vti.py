@@ -56,7 +56,7 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
     axes = direction.T * spacing[:, None]  # the columns of Direction are unit vectors along the axes
     corner = np.array([float(word) for word in image.get("Origin", "0 0 0").split()])
     first = np.array(bounds[::2]) + (0.5 if cells else 0)
-    return scan.placed(values, axes, corner + first @ axes, "relative")
+    return scan.placed(values, axes, corner + first @ axes, "relative", frame="xyz" * ("Direction" in image.attrib))
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:

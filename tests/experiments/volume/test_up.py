@@ -85,10 +85,22 @@ def test_an_observer_sees_the_body_and_not_its_mirror_image(flipped, tmp_path):
     assert around == near
     text = viewpoint(scanned(tmp_path, "view.front=near", flipped=flipped))
     signs = ("", "-") if turned else ("-", "")
-    words = "from {}y in the coordinates of its file, with z up and {}x to the right".format(*signs)
-    assert text.startswith(words) and ("left and right are a guess" in text) == (not turned)
+    sides = ("back", "right") if turned else ("front", "left")
+    words = "from {}y ({}) in the coordinates of its file, with z (head) up and {}x ({}) to the right"
+    assert text == words.format(signs[0], sides[0], signs[1], sides[1])
     stated = scanned(tmp_path, "volume.left_handed=true", flipped=flipped)
     assert "guess" not in viewpoint(stated)
+
+
+def test_directions_without_names_and_files_without_directions(tmp_path):
+    """Axes named by a scanner point to no side of a patient that is known; slices state nothing."""
+    named = viewpoint(scanned(tmp_path, "view.front=near", space="scanner-xyz"))
+    assert "guess" not in named and "(" not in named
+    np.save(tmp_path / "body.npy", np.zeros((4, 4, 4), np.uint8) + np.arange(4, dtype=np.uint8))
+    words = [f"volume={{path: {tmp_path / 'body.npy'}, spacing: 1 mm}}", MARKED]
+    hologram = "hologram={shape: [48, 48], pitch: 8 um, distance: 4 mm, depths: 24}"
+    unknown = build(load_config(CONFIGS / "volume" / "hand.yaml", [*words, hologram]))
+    assert "left and right are a guess" in viewpoint(unknown)
 
 
 def test_a_left_handed_space_is_known(tmp_path):
