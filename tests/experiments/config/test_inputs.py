@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from holotorch.cli import main
-from holotorch.experiments.config.inputs import with_its_files
+from holotorch.experiments.config.inputs import started_in, with_its_files
 from holotorch.experiments.config.source import override, read_source
 from holotorch.experiments.pec import run as run_module
 from holotorch.experiments.registry import load_config
@@ -77,3 +77,10 @@ def test_a_run_whose_start_is_not_known_has_the_paths_of_its_file(tmp_path, text
     source = read_source(tmp_path / "config.yaml", [])
     override(source, "target.region=[1,2,3,4]", [])
     assert with_its_files(source).data["target"] == {"image": str(tmp_path / "mine.png"), "region": [1, 2, 3, 4]}
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"folder": 7}', "[" * 100_000, "\xff"])
+def test_an_env_file_that_says_nothing_is_no_start(text, tmp_path):
+    """Deep nesting is a find of scripts/fuzz.py."""
+    (tmp_path / "env.json").write_text(text, encoding="latin-1")
+    assert started_in(tmp_path) is None
