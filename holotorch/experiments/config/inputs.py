@@ -1,12 +1,12 @@
 """Input files that the configuration of a run names, for commands in another folder than that of the run's start."""
 
+import json
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from holotorch.experiments.config.source import Key, Source
 from holotorch.io.bundled import find_config
-from holotorch.io.files import read_json
 
 _LONGEST = 4096  # characters of a path
 
@@ -25,8 +25,8 @@ def with_its_files(source: Source) -> Source:
 
 def started_in(run: Path) -> Path | None:
     """The folder in which the run of a folder was started; None if its ``env.json`` does not say."""
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        return Path(read_json(run / "env.json")["folder"])
+    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):  # the last, if it is nested deeply
+        return Path(json.loads((run / "env.json").read_text(encoding="utf-8"))["folder"])
     return None
 
 
