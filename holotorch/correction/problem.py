@@ -179,8 +179,8 @@ class PECProblem(nn.Module):
             formed, target = formed * mask, target * mask
         first = -self.image_axes
         if self.scale_free:
-            # The derivative of the loss with respect to s is zero, so s is treated as a constant.
-            scale = best_scale(formed.detach(), target, first)
+            # The derivative of the loss with respect to s is zero, but its second derivatives are not.
+            scale = best_scale(formed, target, first)
             formed = formed * scale.reshape(*scale.shape, *[1] * -first)
         return (formed - target).square().flatten(first).sum(-1)
 

@@ -20,7 +20,7 @@ from holotorch.correction import (
     spread_preconditioner,
 )
 from holotorch.modulator import ThermalCrosstalk
-from holotorch.optics import DepthStack, Fraunhofer, Fresnel, PupilViews, View
+from holotorch.optics import DepthStack, Fraunhofer, Fresnel, Propagator, PupilViews, View
 
 GRID, WAVES = Grid((6, 7), (5e-6, 4e-6)), (630e-9, 530e-9)
 DISTANCES = (0.1e-3, 0.25e-3)
@@ -278,3 +278,29 @@ def test_light_that_misses_the_images_is_a_part_of_the_loss():
     missing = 1 - plain.intensity(phase).sum((-2, -1)).mean(-1) / 30
     torch.testing.assert_close(bright(phase) - plain(phase), 0.4 * target.sum() * missing, rtol=1e-10, atol=0)
     assert 0 < missing.min() < missing.max() < 1
+
+
+@pytest.mark.parametrize("amplitude", [False, True])
+@pytest.mark.parametrize("frames", [False, True])
+def test_second_derivatives_at_the_best_scale_are_those_of_the_formula(amplitude, frames):
+    """The best scale changes with the phases, which first derivatives do not show."""
+    generator = torch.Generator().manual_seed(4)
+    wanted = torch.rand(1, 12, 10, generator=generator, dtype=torch.float64)
+    phase = 3 * torch.rand(*([3] * frames), 1, 12, 10, generator=generator, dtype=torch.float64)
+    heat, propagator = ThermalCrosstalk(0.66), Propagator(Grid((12, 10), 8e-6), 633e-9, 2e-3)
+    problem = PECProblem(heat, propagator, wanted, scale_free=True, amplitude=amplitude, frames=frames)
+
+    def written_out(x):
+        spread = heat(x)
+        formed = propagator(torch.polar(torch.ones_like(spread), spread)).abs().square()
+        formed = formed.mean(0) if frames else formed
+        formed, target = ((formed + 1e-300).sqrt(), wanted.sqrt()) if amplitude else (formed, wanted)
+        scale = (formed * target).sum() / formed.square().sum()
+        return (scale * formed - target).square().sum()
+
+    along = torch.func.grad(written_out)(phase)  # the direction in which most is missing if the scale is a constant
+    for way in (along, torch.rand(phase.shape, generator=generator, dtype=torch.float64)):
+        losses = (lambda x: problem(x).sum()), written_out
+        both = (torch.func.jvp(torch.func.grad(loss), (phase,), (way,)) for loss in losses)
+        for one, other in zip(*both, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-9 * float(other.abs().max()))
