@@ -23,6 +23,7 @@ _REGIONS = (  # meanings of the regions
 )
 _INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller fraction of its light enters the pupil
 _NEAREST = 1e3 / 11  # mm; eyes of 20 years accommodate by 11 dioptres, and older ones by fewer (Duane 1912)
+_AGES = "eyes accommodate by 11 at the age of 20, by 4 at 45"
 _LITTLE = 0.01  # share of the light of the scene's centre in the pupil below which pictures are dim
 
 
@@ -89,7 +90,8 @@ def in_words(values: dict[str, Any]) -> list[str]:
     lines = [
         f"Field      {fields}",
         f"Eye box    {_span(values['eye_box_mm'])} mm wide; {entering} % of the light from the scene's edge enters the "
-        f"pupil; the scene appears {near} to {far} mm from the eye" + (f" ({dioptres} dioptres)" if dioptres else ""),
+        f"pupil; the scene appears {near} to {far} mm from the eye"
+        + (f" ({dioptres} dioptres; {_AGES})" if dioptres else ""),
         f"Regions    centre {_list(values['region_of_centre'])}, edge {_list(values['region_of_edge'])} ({meanings}); "
         f"the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near "
         f"end, {spots[1]} um at the far end",

@@ -7,6 +7,10 @@ from holotorch.experiments.planning.errors import error_line, error_sentence
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
+_COLOURS = (
+    "Colours are those of light of {} nm, mixed to white. The pictures of the volume itself (holotorch check "
+    "--preview, kind volume) have the colours of its transfer function as a screen shows them, which differ."
+)
 _PREDICTED = (
     "The predicted contrast is that of an evenly filled round pupil and fully developed speckle; a scene with "
     "structure has neither and measures lower. Grains are measured in samples of the picture, with the scene divided "
@@ -54,6 +58,8 @@ def eye_section(run: RunRecord) -> list[str]:
     captions |= {"speckle": "spectrum of the speckle, at the first focus: the scene is divided out"}
     captions |= {"focus": "the eye's focus swept over the scene", "geometry": "geometry and sources"}
     parts += [figure(source, caption, "wide") for name, caption in captions.items() if (source := run.picture(name))]
+    if len(summary["wavelengths_nm"]) == 3:
+        parts.append(element("p", _COLOURS.format(" / ".join(f"{each:.0f}" for each in summary["wavelengths_nm"]))))
     first = summary["rows"][0]
     at = f" at {' / '.join(f'{wavelength:.0f}' for wavelength in summary['wavelengths_nm'])} nm"
     names = [key.replace("_", " ") + (at if isinstance(first[key], list) else "") for key in first]

@@ -10,6 +10,7 @@ from holotorch.experiments.joint.budget import COARSE_PLANES, FEW_PLANES, PATIEN
 from holotorch.experiments.joint.config import BASELINES, MOST_PLANES, JointSettings
 from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
+from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.duration import duration
 from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise, response_note
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
@@ -86,6 +87,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
         f"{values['views']} views are corrected together, {settings.eye.parallax} of them through parts of the "
         f"pupil{fewer}",
+        *colours_in_words("volume", settings.wavelengths),
         f"Solver     {_steps(values, experiment)}; compared with {_compared(settings)}",
         f"{experiment.budget.text}; {values['taps']} taps, {values['precision']} in the solver",
         f"Cost       about {duration(values['predicted_seconds'])} ({seconds_in_words(values['seconds_of'])}); "

@@ -287,7 +287,7 @@ def _notes(experiment: PECExperiment) -> list[str]:
             if (share := spot / min(grid.extent)) > _FEW_SPOTS:
                 notes.append(
                     f"{_WARNING}at {farthest * 1e3:.4g} mm a spot is {share:.2g} times as wide as the array, which "
-                    "forms no picture there"
+                    f"forms no picture there{f'; is it {farthest:.4g}mm that was meant?' if farthest >= 1 else ''}"
                 )
             notes.append(
                 f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "

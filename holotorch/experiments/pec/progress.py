@@ -66,11 +66,13 @@ class Log:
         losses = solution.losses[-1].reshape(-1, len(self.experiment.wavelengths)).mean(0).tolist()
         self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", score, *map(repr, losses)])
         self.last = solution
-        # Each stage has a loss of its own, so that the number is relative to the start of the stage.
+        # Each stage has a loss of its own.
         first, stage = solution.state["inner_losses"][0], int(solution.state["stage"]) + 1
         relative = (solution.losses[-1] / first.clamp(min=1e-30)).mean().item()
         shown = {"stage": f"{stage}/{self._stages}"} if self._stages > 1 else {}
-        shown |= {"loss/start": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
+        if stage == 1:  # later stages begin near their end
+            shown["loss/start"] = f"{relative:.2e}"
+        shown["mem"] = f"{peak_memory() / 1e9:.2f}GB"
         if self.checked:
             shown[self.metric] = f"{self.checked[-1][1]:.4f}"
         self.bar.set_postfix(shown, refresh=False)

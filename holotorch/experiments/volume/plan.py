@@ -30,6 +30,7 @@ _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan conta
 _DENSE, _STEEP = 0.5, 0.1  # opacity of a surface, and the part of the range of values within which it rises to that
 _SIDES = {"L": "left", "R": "right", "A": "front", "P": "back", "S": "head", "I": "feet"}  # of a patient
 _OPPOSITE = str.maketrans("LRAPSI", "RLPAIS")
+_SAME_SIZE = 0.01  # logarithm of a ratio of sizes below which they are the same
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the renderings that estimate how much light is cut off, and what is black
 _LIT = 0.05  # value above which a ray is not black
@@ -146,7 +147,8 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         source = f"{settings.volume.phantom} (synthetic: {volume['synthetic']})"
     nearest, farthest = values["depths_mm"]
     lines = [
-        f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide",
+        f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide"
+        f"{_resized(experiment)}",
         f"View       {viewpoint(experiment)}",
         f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
         f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end towards the observer, "
@@ -178,6 +180,16 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     lines += [f"Note       {note}" for note in values["notes"]]
     lines += [f"WARNING    {warning}" for warning in values["warnings"]]
     return "\n".join(lines)
+
+
+def _resized(experiment: VolumeExperiment) -> str:
+    """How many times smaller or larger than in its file the volume is shown, in words; empty if that is not known."""
+    if experiment.volume.unit != "m" or experiment.synthetic:
+        return ""
+    times = max(experiment.volume.extent) / experiment.width
+    if abs(math.log(times)) < _SAME_SIZE:
+        return ""
+    return f", {max(times, 1 / times):.3g} times {'smaller' if times > 1 else 'larger'} than in the file (view.width)"
 
 
 def _physics(experiment: VolumeExperiment) -> dict[str, Any]:

@@ -290,8 +290,8 @@ def test_resume_is_listed(capsys):
 
 
 @pytest.mark.parametrize(("words", "stages"), [([LBFGS], [2, 12]), (CAPPED, [4, 3, 3, 2, 2])])
-def test_the_progress_bar_names_the_stage_and_its_loss_never_jumps_up(words, stages, monkeypatch, tmp_path):
-    """Each stage has a loss of its own; within one, every step of L-BFGS lowers it."""
+def test_the_progress_bar_names_the_stage_and_the_loss_of_the_first(words, stages, monkeypatch, tmp_path):
+    """Each stage has a loss of its own, and later ones begin near their end; every step of L-BFGS lowers it."""
     shown = []
 
     class Watched(Log):
@@ -303,5 +303,6 @@ def test_the_progress_bar_names_the_stage_and_its_loss_never_jumps_up(words, sta
     assert execute(settings(*words), tmp_path / "run")[1]
     names = [f"{k}/{len(stages)}" for k, steps in enumerate(stages, 1) for _ in range(steps)]
     assert [each["stage"] for each in shown] == names
-    for before, after in zip([{"stage": "", "loss/start": ""}, *shown], shown, strict=False):
-        assert float(after["loss/start"]) <= (float(before["loss/start"]) if before["stage"] == after["stage"] else 1.0)
+    losses = [float(each["loss/start"]) for each in shown[: stages[0]]]
+    assert losses == sorted(losses, reverse=True) and losses[0] <= 1
+    assert not any("loss/start" in each for each in shown[stages[0] :])
