@@ -263,16 +263,28 @@ def _refine(point: Tensor, along: Tensor, edges: tuple[Tensor, ...]) -> tuple[Te
 
 
 def _implicit(point: Tensor, along: Tensor, basis: Tensor, edges: tuple[Tensor, ...]) -> Tensor:
-    """A Newton step [B, 5] at the optimum: zero, with the gradient of the optimum with respect to the inputs."""
+    """Newton steps [B, 5] at the optimum: zero, with the derivatives of the optimum with respect to the inputs.
+
+    With a constant matrix of second derivatives, the first step has the first derivatives, and the second step the
+    second ones, too.
+    """
+
+    def slope(unknown: Tensor, some: Tensor | slice) -> Tensor:
+        at = point[some] + unknown[:, :3], tilted(along[some], basis[some], unknown[:, 3:])
+        cost = 0.5 * _residuals(*at, basis[some], tuple(each[some] for each in edges))[0].square().sum()
+        return torch.autograd.grad(cost, unknown, create_graph=True)[0]
+
     unknown = torch.zeros(len(point), 5, dtype=point.dtype, device=point.device, requires_grad=True)
-    at = point + unknown[:, :3], tilted(along, basis, unknown[:, 3:])
-    cost = 0.5 * _residuals(*at, basis, edges)[0].square().sum()
-    slope = torch.autograd.grad(cost, unknown, create_graph=True)[0]
-    rows = [torch.autograd.grad(slope[:, i].sum(), unknown, retain_graph=True)[0] for i in range(5)]
+    first = slope(unknown, slice(None))
+    rows = [torch.autograd.grad(first[:, i].sum(), unknown, retain_graph=True)[0] for i in range(5)]
     inverse = torch.linalg.inv_ex(torch.stack(rows, 1)).inverse.detach()
     # A pose that cannot be computed has no derivative, and must not make that of shared inputs NaN.
-    inverse = torch.where(torch.isfinite(inverse).flatten(1).all(-1)[:, None, None], inverse, 0.0)
-    return -(inverse @ slope[..., None])[..., 0]
+    known = torch.isfinite(inverse).flatten(1).all(-1)
+    inverse = torch.where(known[:, None, None], inverse, 0.0)
+    change = -(inverse @ first[..., None])[..., 0]
+    some = known.nonzero()[:, 0]
+    again = inverse[some] @ slope(change[some], some)[..., None]
+    return change.index_add(0, some, -again[..., 0])
 
 
 def _statuses(visible: Tensor, known: Tensor, failed: Tensor, point: Tensor) -> tuple[Status, ...]:

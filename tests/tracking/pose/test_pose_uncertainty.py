@@ -85,6 +85,25 @@ def test_gradcheck():
     assert (ends[0] - ends[1]).item() / 2 == pytest.approx((gradient * step).sum().item(), rel=1e-6)
 
 
+def test_second_derivatives():
+    """Of tip and direction by edges that no pose fits exactly, against differences of the first derivatives."""
+    edges, positions, *_ = parameters(0.1)
+    generator = torch.Generator().manual_seed(2)
+    edges = edges + 0.5 * torch.randn(edges.shape, generator=generator, dtype=torch.float64)
+    weights = torch.randn(6, generator=generator, dtype=torch.float64)
+
+    def gradient(at, **options):
+        pose = solve_pose(at, positions, CAMERA)
+        return torch.autograd.grad((torch.cat([pose.tip, pose.direction], -1) @ weights).sum(), at, **options)[0]
+
+    way = torch.randn(edges.shape, generator=generator, dtype=torch.float64)
+    at = edges.clone().requires_grad_()
+    (seen,) = torch.autograd.grad((gradient(at, create_graph=True) * way).sum(), at)
+    ends = [gradient((edges + sign * 1e-2 * way).requires_grad_()) for sign in (1, -1)]
+    difference = (ends[0] - ends[1]) / 2e-2
+    assert (seen - difference).norm() < 1e-3 * difference.norm()
+
+
 def test_refused_poses_do_not_spoil_gradients():
     edges = torch.cat([image()[None]] * 5).clone()
     edges[1] = 500.0  # one point
