@@ -188,7 +188,7 @@ class PhotometricFit(nn.Module):
     tried. A rolling shutter cannot be distinguished from another pose: state ``readout`` in the plan.
 
     The result is differentiable with respect to the frames, the camera and the catheter, by the implicit function
-    theorem at the optimum.
+    theorem at the optimum. Only first derivatives are those of the optimum.
 
     Args:
         camera: Intrinsics and tone curve.
