@@ -16,8 +16,8 @@ import torch
 from holotorch.core.fourier import fft2
 from holotorch.io.files import read_json
 
-_SIDE, _SECONDS = 256, 0.04  # samples along each side of the transform that is timed, and time spent on it
-_GAIN = 1.2  # ratio of times above which fewer threads are taken
+_SIDE, _SECONDS = 512, 0.06  # samples along each side of the transform that is timed, and time spent on it
+_GAIN = 1.5  # ratio of times above which fewer threads are taken
 
 
 @contextmanager

@@ -25,7 +25,7 @@ def solve_pose(
 
     Levenberg-Marquardt steps from a linear solution (the null vector of ``u_i x (A + s_i d) = 0``) minimise the
     reprojection error in five unknowns. Three visible points determine a pose that nothing verifies; its status is
-    UNVERIFIED. The pose is differentiable with respect to all tensors by the implicit function theorem.
+    UNVERIFIED. The pose is differentiable, twice, with respect to all tensors by the implicit function theorem.
 
     Args:
         edges_px: [B, N, 2] pixels (x, y) of the points; NaN for a point that is not visible.
