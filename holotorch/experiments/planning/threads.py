@@ -1,7 +1,7 @@
 """Threads of a command on a machine that other programs use, too.
 
 The threads of torch wait for each other after every operation. If another program holds one of the processors, each
-operation lasts as long as the turn of that program: a transform of 256 x 256 samples 16 ms in place of 0.1 ms.
+operation lasts as long as the turn of that program: a transform of 256 x 256 samples 16 ms instead of 0.1 ms.
 """
 
 import os
@@ -34,7 +34,7 @@ def undisturbed(resumed: Path | None = None) -> Iterator[None]:
         chosen, why = (_fastest(before), why) if begun is None else (begun, "as the run was begun")
     if chosen != before:
         print(f"Threads    {chosen}, not {before}: {why} (OMP_NUM_THREADS={before} before the command changes that)")
-        torch.set_num_threads(chosen)
+    torch.set_num_threads(chosen)  # the comparison has changed it
     try:
         yield
     finally:

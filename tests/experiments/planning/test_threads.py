@@ -14,7 +14,12 @@ def four(monkeypatch):
     """A process with four threads, whose transforms take the seconds in the dictionary that is returned."""
     times = {4: 1.0, 3: 1.0, 2: 1.0, 1: 3.0}
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(threads, "_mean_seconds", times.__getitem__)
+
+    def timed(count: int) -> float:
+        torch.set_num_threads(count)  # as the real one does
+        return times[count]
+
+    monkeypatch.setattr(threads, "_mean_seconds", timed)
     monkeypatch.setattr(threads.os, "cpu_count", lambda: 4)
     before = torch.get_num_threads()
     torch.set_num_threads(4)
