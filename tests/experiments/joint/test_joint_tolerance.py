@@ -147,9 +147,9 @@ def test_a_psnr_is_stated_beside_that_of_an_exact_calculation(noisy):
     summary = {
         "methods": {"joint": numbers},
         "errors": [
-            {"part": "heat", "predicted": 1.0, "measured": 0.0},
+            {"part": "heat", "predicted": 1.0, "measured": None},  # would have taken too long
             {"part": "planes", "predicted": 1.0, "measured": 1.0},  # of what is wanted, not of what is shown
-            {"part": "propagation", "predicted": noisy, "measured": None},
+            {"part": "propagation", "predicted": 1.0, "measured": noisy},
         ],
     }
     stated = re.search(r"\(([\d.]+) dB by exact heat and light\)", joint_outcome(summary)[0])
