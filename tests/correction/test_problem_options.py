@@ -299,8 +299,8 @@ def test_second_derivatives_at_the_best_scale_are_those_of_the_formula(amplitude
         return (scale * formed - target).square().sum()
 
     along = torch.func.grad(written_out)(phase)  # the direction in which most is missing if the scale is a constant
-    for way in (along, torch.rand(phase.shape, generator=generator, dtype=torch.float64)):
+    for direction in (along, torch.rand(phase.shape, generator=generator, dtype=torch.float64)):
         losses = (lambda x: problem(x).sum()), written_out
-        both = (torch.func.jvp(torch.func.grad(loss), (phase,), (way,)) for loss in losses)
+        both = (torch.func.jvp(torch.func.grad(loss), (phase,), (direction,)) for loss in losses)
         for one, other in zip(*both, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-9 * float(other.abs().max()))

@@ -68,7 +68,7 @@ def _exact(summary: dict[str, Any], scores: dict[str, Any], key: str) -> str:
     The error of the calculation is added to that of the pictures in squares, since neither knows of the other.
     """
     errors = {each["part"]: each["measured"] for each in summary.get("errors", ())}
-    own = math.hypot(errors.get(HEAT) or 0.0, errors.get(PROPAGATION) or 0.0)  # predicted ones may be far too large
+    own = math.hypot(errors.get(HEAT) or 0.0, errors.get(PROPAGATION) or 0.0)  # predicted ones may be much too large
     off = scores.get(f"{key}_error", math.inf)  # runs of before have none
     lost = 20 * math.log10(math.hypot(1, own / off)) if off > 0 else math.inf
     return f" ({scores[f'{key}_psnr'] - lost:.1f} dB by exact heat and light)" if _CLOSE < lost < math.inf else ""

@@ -36,7 +36,10 @@ def is_cut_off(kernel: Tensor) -> bool:
 
 
 def heat_beyond(kernel: Tensor) -> float:
-    """Heat beyond a table, relative to that within, if it falls on as in :func:`continued`; 0 where that is unknown."""
+    """Heat beyond the table of a kernel [h, w], relative to that within, if it falls on as in :func:`continued`.
+
+    0 where that is unknown.
+    """
     whole = continued(kernel / kernel.max(), (_WIDEST, _WIDEST))
     return 0.0 if whole is None else float(whole.sum() / kernel.double().sum() * kernel.max()) - 1
 

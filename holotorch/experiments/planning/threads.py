@@ -25,7 +25,7 @@ def undisturbed(resumed: Path | None = None) -> Iterator[None]:
     """Compute within this block with fewer threads if that is faster now, and say so.
 
     OMP_NUM_THREADS, where it is set, is followed. A run that is ``resumed`` goes on with as many threads as it was
-    begun with, since sums of another number of threads are rounded otherwise.
+    begun with, since sums of another number of threads are rounded otherwise. The number of before is restored.
     """
     before = torch.get_num_threads()
     chosen, why = before, "other programs use the processors"

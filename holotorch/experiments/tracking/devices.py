@@ -121,6 +121,7 @@ def load_camera(path: Path | str, overrides: Sequence[str] = ()) -> CameraSettin
 def calibration_sd(settings: CameraSettings, catheter: Catheter, pose: Pose) -> float | None:
     """Standard deviation in metres that the camera's calibration adds to the tip of a pose; None without one.
 
+    ``pose`` is that of one catheter, in the camera's frame, and ``settings`` are those of the camera that saw it.
     The tip of the same edges is solved with each of fx, fy, cx and cy changed by its deviation, and the displacements
     are added in squares. Those of the distortion are left out: they make up for one another between the boards.
     """

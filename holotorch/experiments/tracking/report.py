@@ -197,7 +197,7 @@ def camera_line(summary: dict[str, Any]) -> list[str]:
     if (added := summary.get("calibration_sd_mm")) is None or "tip_sd_mm" not in summary:
         return []
     return [
-        f"Camera     its calibration adds about {added:.2g} mm (sd) to the tips, alike in all frames, to the "
+        f"Camera     its calibration adds about {added:.2g} mm (sd) to the tips, the same in all frames, to the "
         f"{summary['tip_sd_mm']['median']:.2g} mm that the frames leave open (sd in overlay and poses.csv)"
     ]
 

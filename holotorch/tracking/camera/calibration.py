@@ -174,7 +174,7 @@ def _no_single_camera(fit: Estimate, names: Sequence[str]) -> str:
     return (
         f"the views fit no single camera: half of them by {scatter:.1f} px or worse, {names[worst]} by "
         f"{fit.errors[worst]:.1f} px; leave out those of another camera, zoom or board, and give the corners of the "
-        "whole board: in a part of it, such as 8x5 of 9x6, other corners are found in each view"
+        "whole board: in a part of it, such as 8x5 of 9x6, other corners are detected in each view"
     )
 
 

@@ -24,9 +24,9 @@ def edges(camera, tip, direction):
 
 
 def test_it_is_the_spread_of_the_tips_over_cameras_that_the_calibration_cannot_tell_apart():
-    found = pose()
-    seen, generator, tips = (
-        edges(build_camera(CAMERA), found.tip, found.direction),
+    fitted = pose()
+    observed, generator, tips = (
+        edges(build_camera(CAMERA), fitted.tip, fitted.direction),
         torch.Generator().manual_seed(3),
         [],
     )
@@ -34,9 +34,9 @@ def test_it_is_the_spread_of_the_tips_over_cameras_that_the_calibration_cannot_t
         shift = torch.randn(4, generator=generator).tolist()
         names = ("fx", "fy", "cx", "cy")
         other = {name: getattr(CAMERA, name) + DEVIATIONS[name] * x for name, x in zip(names, shift, strict=True)}
-        tips.append(solve_pose(seen, THESIS.positions, build_camera(CAMERA.model_copy(update=other))).tip[0])
+        tips.append(solve_pose(observed, THESIS.positions, build_camera(CAMERA.model_copy(update=other))).tip[0])
     spread = float(torch.stack(tips).var(0).sum().sqrt())
-    added = calibration_sd(CAMERA, THESIS, found)
+    added = calibration_sd(CAMERA, THESIS, fitted)
     assert added == pytest.approx(spread, rel=0.1) and 5e-4 < spread < 5e-3
 
 

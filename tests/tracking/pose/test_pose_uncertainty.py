@@ -96,12 +96,12 @@ def test_second_derivatives():
         pose = solve_pose(at, positions, CAMERA)
         return torch.autograd.grad((torch.cat([pose.tip, pose.direction], -1) @ weights).sum(), at, **options)[0]
 
-    way = torch.randn(edges.shape, generator=generator, dtype=torch.float64)
+    direction = torch.randn(edges.shape, generator=generator, dtype=torch.float64)
     at = edges.clone().requires_grad_()
-    (seen,) = torch.autograd.grad((gradient(at, create_graph=True) * way).sum(), at)
-    ends = [gradient((edges + sign * 1e-2 * way).requires_grad_()) for sign in (1, -1)]
+    (second,) = torch.autograd.grad((gradient(at, create_graph=True) * direction).sum(), at)
+    ends = [gradient((edges + sign * 1e-2 * direction).requires_grad_()) for sign in (1, -1)]
     difference = (ends[0] - ends[1]) / 2e-2
-    assert (seen - difference).norm() < 1e-3 * difference.norm()
+    assert (second - difference).norm() < 1e-3 * difference.norm()
 
 
 def test_refused_poses_do_not_spoil_gradients():
