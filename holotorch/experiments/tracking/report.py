@@ -19,6 +19,7 @@ from holotorch.io.files import write_bytes
 from holotorch.io.video import Frame, Frames
 from holotorch.tracking import Pose, Status
 from holotorch.tracking.evaluation.protocols import counts, s_rms
+from holotorch.tracking.pose.status import BEYOND_TIP
 
 # Columns of poses.csv, which has a line per frame. Lengths are in metres in the camera's coordinates (x right, y down,
 # z forward), directions point from the tip to the rear, the covariance of the tip is given by its upper triangle, and
@@ -90,6 +91,7 @@ class Log:
     def take(self, item: Tracked, drawn: Tensor | None) -> None:
         """Add a frame and its overlay, uint8 [3, H, W]."""
         pose = item.pose
+        self.beyond += pose.reason == BEYOND_TIP
         if drawn is not None and self.wants(item):
             smaller = avg_pool2d(drawn.double() / 255, max(1, min(drawn.shape[-2:]) // 400))
             save_picture(self.images / item.status.name, smaller)
@@ -141,8 +143,8 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     notes = list(frames.notes)
     if 2 * log.beyond > answered:
         notes.append(
-            f"wrong tips: in {log.beyond} of {answered} poses the tube goes on beyond the tip; are `edges` counted "
-            "from the tip, in their order, and the bands named from the tip on?"
+            f"wrong tips: in {log.beyond} of {answered} poses, UNVERIFIED for that, the tube goes on beyond the tip; "
+            "are `edges` counted from the tip, in their order, and the bands named from the tip on?"
         )
     if still:
         try:

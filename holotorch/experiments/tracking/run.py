@@ -51,6 +51,7 @@ from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.detection.ends import shows_beyond_tip
 from holotorch.tracking.pose.alignment import in_frame
 from holotorch.tracking.pose.overlay import overlay
+from holotorch.tracking.pose.status import BEYOND_TIP
 from holotorch.tracking.streaming.packet import now
 
 _CONFIRMED = 3  # number of poses in a row from which on the next frame is searched near the last one
@@ -90,6 +91,16 @@ def follow(frames: Iterable[Frame], tracker: Tracker, batch: int = 1) -> Iterato
             previous = [pose] if batch == 1 and answered >= _CONFIRMED else None
 
 
+def _followed(frames: Iterable[Frame], inputs: TrackingInputs, batch: int = 1) -> Iterator[Tracked]:
+    """As :func:`follow`; a pose beyond whose tip the tube goes on is UNVERIFIED."""
+    lens = Lens(inputs.camera)
+    for item in follow(frames, inputs.tracker, batch):
+        pose, pixels = item.pose, item.frame.pixels
+        if pixels is not None and pose.answered and shows_beyond_tip(pixels, lens, pose, inputs.catheter):
+            item = item._replace(pose=replace(pose, status=Status.UNVERIFIED, reason=BEYOND_TIP))
+        yield item
+
+
 def live(
     sources: Sequence[str],
     camera: Path | None,
@@ -113,7 +124,7 @@ def _live(inputs: TrackingInputs, see: Callable[[Tensor, Pose, float], None] | N
         for note in frames.notes:
             print(note, flush=True)
         printed, start = len(frames.notes), None
-        for item in follow(frames, inputs.tracker):
+        for item in _followed(frames, inputs):
             start = now() - item.frame.seconds if start is None else start
             # The capture time of a live frame is approximated by the time at which the tracker began.
             captured = now() - item.seconds if frames.live else start + item.frame.seconds
@@ -278,7 +289,7 @@ def _track_all(
     opened: list[AbstractContextManager[Any]],
 ) -> None:
     """Track all frames and write the results until a signal arrives; the files it opens are appended to ``opened``."""
-    folder, frames, settings, lens = run.path, inputs.frames, experiment.settings, Lens(inputs.camera)
+    folder, frames, settings = run.path, inputs.frames, experiment.settings
 
     def entered(context: AbstractContextManager[Entered]) -> Entered:
         value = context.__enter__()
@@ -299,7 +310,7 @@ def _track_all(
         recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, inputs.paths)
         source = _recorded(source, entered(recorder), run.signals)
     bar = entered(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
-    for item in follow(source, inputs.tracker, settings.batch):
+    for item in _followed(source, inputs, settings.batch):
         with deferred(run.signals):
             _append(table, row(item))
             if in_headset and experiment.to_headset:
@@ -312,8 +323,6 @@ def _track_all(
             if movie and drawn is not None:
                 movie.write(drawn)
             log.take(item, drawn)
-            if item.frame.pixels is not None and item.pose.answered:
-                log.beyond += shows_beyond_tip(item.frame.pixels, lens, item.pose, inputs.catheter)
             bar.set_postfix_str(f"{item.status.name}, {1e3 * item.seconds:.1f} ms", refresh=False)
             bar.update()
         if run.signals:

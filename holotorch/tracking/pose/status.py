@@ -14,7 +14,7 @@ class Status(enum.IntEnum):
     """Result of tracking in one frame: a pose, or the reason why the first failing stage refused one."""
 
     OK = 0
-    UNVERIFIED = 1  # a pose from three edges: no further edge verifies it
+    UNVERIFIED = 1  # a pose from three edges, which no further edge verifies, or one that the tube goes beyond
     BAD_FRAME = 2  # the frame is unreadable, of the wrong size, or without contrast
     NO_CATHETER = 3  # nothing thin and long has the colours of the bands
     BANDS_MISSING = 4  # fewer than two neighbouring bands are visible
@@ -38,6 +38,8 @@ class Status(enum.IntEnum):
 
 
 THREE_EDGES = "three edges determine a pose and leave nothing to check it with"  # reason of an UNVERIFIED pose
+# Reason of an UNVERIFIED pose, too.
+BEYOND_TIP = "the tube goes on beyond the tip, which is then wrong, or another object lies there"
 # In the order of Status.
 _STAGES = ("pose", "pose", "frame", "colour", "colour", "axis", "axis", "edges", "edges", "camera", "pose", "pose")
 

@@ -142,6 +142,8 @@ def test_a_tube_that_goes_on_beyond_the_tip_is_noted(folder, tmp_path, offset, w
     told = json.loads((out / "summary.json").read_text())
     assert told["answered"] == 3
     assert any("wrong tips: in 3 of 3 poses" in note for note in told["notes"]) is wrong
+    with open(out / "poses.csv", newline="") as stream:
+        assert {pose["status"] for pose in csv.DictReader(stream)} == {"UNVERIFIED" if wrong else "OK"}
 
 
 def test_other_tables_of_that_name_and_frames_beyond_it_are_left_out(tmp_path):

@@ -236,7 +236,7 @@ def test_a_live_pose_has_the_time_of_its_frame_not_of_its_tracking(tmp_path, tra
     monkeypatch.setattr(track_source, "open_frames", lambda *_: camera)
     monkeypatch.setattr(tracking_run, "now", lambda: 100.0)
 
-    def slow(frames, tracker):
+    def slow(frames, tracker, batch):
         return (Tracked(i, frame, tracker(frame.pixels[None])[0], 0.25 + i, {}) for i, frame in enumerate(frames))
 
     monkeypatch.setattr(tracking_run, "follow", slow)
