@@ -158,8 +158,8 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         f"Phases     {settings.seeds} realisation(s) of the random phases, compared with the mean of "
         f"{8 * settings.seeds} others",
         eye.budget.text,
-        f"Cost       about {duration(values['predicted_seconds'])} for {values['images']} images "
-        f"({seconds_in_words(values['seconds_of'])}); "
+        f"Cost       about {duration(values['predicted_seconds'])} for {values['images']} images of one wavelength "
+        f"each ({seconds_in_words(values['seconds_of'])}); "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     if sweep := settings.sweep:
