@@ -264,7 +264,8 @@ def _parser() -> argparse.ArgumentParser:
 
     chart = command("chart", _chart, "speed against accuracy of every method, as a figure and a table")
     subjects = (
-        "camera, chain, devices, eye, joint, network, pec, propagation, retina, scaling, stability, tracking, volume"
+        "camera, chain, devices, eye, joint, network, pec, propagation, retina, scaling, stability, tracking, volume, "
+        "whole"
     )
     chart.add_argument("subject", help=f"what to chart: {subjects}, or all, on one page")
     chart.add_argument("--quick", action="store_true", help="a reduced form, which takes seconds and tests no goal")

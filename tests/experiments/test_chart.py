@@ -34,6 +34,12 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     assert "predicted error: true / predicted" in capsys.readouterr().out
 
 
+def test_the_help_names_every_subject(capsys):
+    with pytest.raises(SystemExit):
+        main(["chart", "--help"])
+    assert set(CHARTS) <= set(re.split(r"[,\s]+", capsys.readouterr().out))
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_quick_chart_says_so_and_is_not_beside_the_committed_ones(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_propagation, "QUICK", replace(SMALL, cases=(SMALL.shown,), predictions=2))
