@@ -61,7 +61,7 @@ MEANINGS = {
     "ScatteringSettings.ambient": "light from everywhere",
     "ScatteringSettings.strength": "light of the lamp",
     "ScatteringSettings.anisotropy": "anisotropy g of the scattering: 0 is isotropic, towards 1 forward",
-    "ViewSettings.up": "direction of the stored voxels that points up: -y the first row, z or -z for axial slices",
+    "ViewSettings.up": "what points up: head (a patient, facing you), or a direction of the voxels: -y the first row",
     "ViewSettings.azimuth_deg": "rotation of the volume about the vertical axis, before the elevation",
     "ViewSettings.elevation_deg": "rotation of the volume about the horizontal axis: more shows more of its top",
     "ViewSettings.width": "length of the volume's longest side; by default the longest side of the hologram",

@@ -12,7 +12,7 @@ from holotorch.experiments.joint.experiment import JointExperiment, with_planes
 from holotorch.experiments.joint.seconds import seconds_of, step_views, view_samples
 from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.duration import duration
-from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise, response_note
+from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, opposite_noise, response_note
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.experiments.volume.plan import cut_off, dark_picture, preset_note, unlit, viewpoint
 from holotorch.optics.light.coherence import depth_of_focus
@@ -66,8 +66,8 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
     if display.kernel is not None:
         size = " x ".join(map(str, experiment.crosstalk.kernel.shape))
         spread = f"heat spreads by the measured kernel {display.kernel}, {size} px"
-        if (noise := outer_noise(experiment.crosstalk.kernel)) > NOISY:
-            spread += f", whose taps differ as by noise of {noise:.1g} of the centre"
+        if (noise := opposite_noise(experiment.crosstalk.kernel)) > NOISY:
+            spread += f", whose opposite taps differ as by noise of {noise:.1g} of the centre"
     usual = display.rad_per_K == type(display).model_fields["rad_per_K"].default
     thesis = ", that of the thesis's chip" if usual else ""
     memory = "" if heat is None else f"; {_left(settings):.1%} of the heat is left after a frame"

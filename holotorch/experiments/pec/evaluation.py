@@ -11,7 +11,7 @@ from holotorch.core.complex import intensity
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.weight import zone_scores
-from holotorch.experiments.planning.heat_kernel import continued, is_cut_off
+from holotorch.experiments.planning.heat_kernel import NOISY, continued, even, is_cut_off, opposite_noise
 from holotorch.metrics import SSIM_WINDOW, dark_spots, psnr, ssim
 from holotorch.modulator import PhasedArray, ThermalCrosstalk
 from holotorch.optics import CroppedKernel
@@ -103,6 +103,17 @@ def with_noisy_kernels(experiment: PECExperiment, phase: Tensor, noise: float) -
         kernel[kernel.shape[0] // 2, kernel.shape[1] // 2] = 1
         scores.append(_with_kernel(experiment, phase, kernel))
     return {"noise": noise} | {name: [score[name] for score in scores] for name in scores[0]}
+
+
+def with_even_kernel(experiment: PECExperiment, phase: Tensor) -> dict[str, Any] | None:
+    """Scores of heater phases [F, C, H, W] where heat spreads alike to opposite sides.
+
+    None for a Gaussian kernel, and for a measured one whose opposite taps hardly differ.
+    """
+    kernel = experiment.array.crosstalk.kernel
+    if experiment.settings.modulator.kernel is None or (noise := opposite_noise(kernel)) <= NOISY:
+        return None
+    return _with_kernel(experiment, phase, even(kernel)) | {"noise": noise}
 
 
 def with_continued_kernel(experiment: PECExperiment, phase: Tensor) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import evaluations, padded_samples, seconds_of
 from holotorch.experiments.planning.colours import colours_in_words
 from holotorch.experiments.planning.duration import duration
-from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, outer_noise, response_note
+from holotorch.experiments.planning.heat_kernel import NOISY, cut_off_note, opposite_noise, response_note
 from holotorch.experiments.planning.machine import machine_speed, seconds_in_words
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
@@ -112,11 +112,13 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         lines += colours_in_words("picture", settings.wavelengths)
     if "distance_mm" in physics:
         periodic = f"; the periodic model is alias-free up to {_listed(physics['alias_free_mm'])} mm"
+        blurred = max(physics["distance_mm"], key=abs)
+        blurred = ": fine detail is blurred there" if abs(blurred) > physics["resolved_mm"] else ""
         lines.append(
             f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot of each colour"
             f"{', at the farthest,' if len(physics['distance_mm']) > 1 else ''} {_listed(physics['spot_um'])} um, "
             f"sampled every {physics['pitch_um'][1]:.4g} um, which the array resolves up to "
-            f"{physics['resolved_mm']:.3g} mm{'' if experiment.isolated else periodic}"
+            f"{physics['resolved_mm']:.3g} mm{blurred}{'' if experiment.isolated else periodic}"
         )
     if planned := values.get("single_propagation"):
         lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
@@ -161,7 +163,7 @@ def _measured(experiment: PECExperiment) -> dict[str, Any]:
     """The measured kernel, and the Gaussian that fits it best."""
     kernel = experiment.array.crosstalk.kernel
     values = {"kernel": experiment.settings.modulator.kernel, "taps": list(kernel.shape), "total": kernel.sum().item()}
-    values["noise"] = outer_noise(kernel)
+    values["noise"] = opposite_noise(kernel)
     try:
         fitted = ThermalCrosstalk.fitted(kernel)
     except ValueError:  # a single pixel, or one that is as warm as its surroundings
@@ -191,10 +193,10 @@ def _crosstalk_line(values: dict[str, Any]) -> str:
                 f"{values['fit_residual']:.2g} of it (rms)"
             )
             if values["fit_residual"] > _NO_GAUSSIAN:
-                line += ", more than noise: a sigma alone would not represent this kernel"
+                line += ": a sigma alone would not represent this kernel"
         if (noise := values["noise"]) > NOISY:
             line += (
-                f"; opposite taps of its outermost ring differ as by noise of {noise:.1g} of the centre: "
+                f"; opposite taps differ as by noise of {noise:.1g} of the centre: "
                 f"report.kernel_noise={noise:.1g} tells what that costs"
             )
         return line

@@ -155,6 +155,12 @@ def _other_kernels(corrected: dict[str, Any]) -> list[str]:
         scores = [text.format(min(numbers[name])) for name, text in names.items() if name in numbers]
         chips = f"at worst of {max(len(value) for value in numbers.values() if isinstance(value, list))} chips"
         lines.append(f"noise of {100 * numbers['noise']:g} % of the centre in every tap: {', '.join(scores)} {chips}")
+    if numbers := corrected.get("kernel_even"):
+        scores = [text.format(numbers[name]) for name, text in names.items() if numbers.get(name) is not None]
+        lines.append(
+            f"opposite taps of the measured table differ as by noise of {numbers['noise']:.1g} of the centre; if heat "
+            f"spreads as their means: {', '.join(scores)}"
+        )
     if numbers := corrected.get("kernel_continued"):
         scores = [text.format(numbers[name]) for name, text in names.items() if numbers.get(name) is not None]
         size = " x ".join(map(str, numbers["taps"]))

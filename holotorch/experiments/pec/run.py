@@ -17,6 +17,7 @@ from holotorch.experiments.pec.evaluation import (
     evaluate,
     speckle_spots,
     with_continued_kernel,
+    with_even_kernel,
     with_noisy_kernels,
 )
 from holotorch.experiments.pec.experiment import PECExperiment
@@ -114,6 +115,8 @@ def _with_other_kernels(experiment: PECExperiment, phase: Tensor) -> dict[str, A
     phase, numbers = phase[:, experiment.lit].to(experiment.device), dict[str, Any]()
     if (noise := experiment.settings.report.kernel_noise) is not None:
         numbers["kernel_noise"] = with_noisy_kernels(experiment, phase, noise)
+    if (scores := with_even_kernel(experiment, phase)) is not None:
+        numbers["kernel_even"] = scores
     if (scores := with_continued_kernel(experiment, phase)) is not None:
         numbers["kernel_continued"] = scores
     return numbers

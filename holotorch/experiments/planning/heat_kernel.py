@@ -14,13 +14,19 @@ _WIDEST = 401  # taps of a table that is continued, at most
 _LEAST = 1e-6  # rise of a tap, relative to the centre, whose logarithm is taken for a smaller one
 
 
-def outer_noise(kernel: Tensor) -> float:
-    """Noise of the taps of a kernel [h, w], relative to its centre: of the outermost ring, where heat is least.
+def opposite_noise(kernel: Tensor) -> float:
+    """Noise of the taps of a kernel [h, w], relative to its centre, if heat spreads alike to opposite sides.
 
-    Heat spreads as far to one side as to the opposite one, so that opposite taps of the ring differ by noise alone.
+    It is the larger one of that in all taps and that in the outermost ring.
     """
-    ring = _ring(kernel, 0)
-    return (kernel - kernel.flip((0, 1)))[ring].square().mean().div(2).sqrt().item()
+    differences = (kernel - kernel.flip((0, 1))).square() / 2
+    parts = [part.mean().sqrt().item() for part in (differences, differences[_ring(kernel, 0)])]
+    return max(parts) / kernel.max().item()
+
+
+def even(kernel: Tensor) -> Tensor:
+    """The kernel [h, w] with the mean of opposite taps in both of them."""
+    return (kernel + kernel.flip((0, 1))) / 2
 
 
 def warm_ring(kernel: Tensor) -> float:

@@ -115,9 +115,9 @@ class ViewSettings(Settings):
     """Orientation and size of the volume.
 
     ``up`` is the direction of the volume that points up: -y shows its first row on top; z or -z stands a scan in axial
-    slices upright. The volume is then rotated by ``azimuth_deg`` about the vertical axis, and by ``elevation_deg``
-    about the horizontal axis (x). ``width`` is the length of its longest side in metres, by default the longest side of
-    the hologram.
+    slices upright. ``head`` stands a patient upright, the face to the observer, if the file says how he lies. The
+    volume is then rotated by ``azimuth_deg`` about the vertical axis, and by ``elevation_deg`` about the horizontal
+    axis (x). ``width`` is the length of its longest side in metres, by default the longest side of the hologram.
     ``front`` says which end of the volume faces the observer: the one far from the hologram, for a display that forms
     the scene in front of it (by the conjugate field, as eye runs do), or the near one, for a virtual image behind it.
     Runs of kind joint put either end next to their array. Either observer sees the volume as it was scanned, not its
@@ -129,7 +129,7 @@ class ViewSettings(Settings):
     many.
     """
 
-    up: Literal["-y", "y", "z", "-z", "x", "-x"] = "-y"
+    up: Literal["-y", "y", "z", "-z", "x", "-x", "head"] = "-y"
     azimuth_deg: Number = 0.0
     elevation_deg: Number = 0.0
     width: Annotated[Length, plausible(WIDTH)] | None = None

@@ -109,12 +109,13 @@ class VolumeExperiment:
         a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg) * (1 if view.front == "far" else -1)
         about_y = ((math.cos(a), 0, math.sin(a)), (0, 1, 0), (-math.sin(a), 0, math.cos(a)))
         about_x = ((math.cos(e), -math.sin(e), 0), (math.sin(e), math.cos(e), 0), (0, 0, 1))
-        x, y, standing = (torch.tensor(rows, dtype=torch.float64) for rows in (about_x, about_y, _STANDING[view.up]))
-        rotation = x @ y @ standing
-        if view.front == "far":  # of the mirrored volume, see _unmirrored
-            mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
-            rotation = mirror[:, None] * rotation * mirror
-        return rotation.round(decimals=15)
+        x, y = (torch.tensor(rows, dtype=torch.float64) for rows in (about_x, about_y))
+        mirror = torch.tensor([1.0, 1.0, 1.0 if view.front == "near" else -1.0], dtype=torch.float64)  # see _unmirrored
+        if view.up == "head":
+            standing = _facing(self.volume, view.front)
+        else:
+            standing = mirror[:, None] * torch.tensor(_STANDING[view.up], dtype=torch.float64) * mirror
+        return (mirror[:, None] * (x @ y) * mirror @ standing).round(decimals=15)
 
     @cached_property
     def depths(self) -> tuple[float, ...]:
@@ -357,7 +358,7 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
         device = find_device(settings.device)
         volume = replace(volume, values=volume.values.to(device))
         experiment = VolumeExperiment(settings, volume, synthetic, device)
-        _ = experiment.transfer  # read now, so that its errors are reported
+        _ = experiment.transfer, experiment.rotation  # computed now, so that errors are reported
     except ValueError as error:
         raise ConfigError([f"volume: {error}"]) from error
     except OSError as error:
@@ -371,6 +372,30 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     if (nearest := min(experiment.depths)) <= 0:
         raise ConfigError([f"hologram.distance: the volume extends behind the hologram, to {nearest:g} m"])
     return experiment
+
+
+def _facing(volume: Volume, front: str) -> Tensor:
+    """Rotation, for vectors (z, y, x), that stands a patient upright and turns the face to the observer.
+
+    It takes axes of the voxels to axes of the scene, so that a scan that was tilted stays so.
+    """
+    sides = [volume.frame[::-1].find(letter) for letter in "SIAP"]  # axes z, y, x of the file
+    if max(sides[:2]) < 0 or max(sides[2:]) < 0:
+        raise ConfigError(
+            [
+                "view.up: head is known for files that say how a patient lies (DICOM, NIfTI, MetaImage, NRRD), and "
+                "this volume does not; give the direction of the voxels that points up: -y, y, z, -z, x or -x"
+            ]
+        )
+    free, found = torch.ones(3, dtype=torch.float64), []
+    for positive, negative in (sides[:2], sides[2:]):
+        along = torch.tensor(volume.orientation, dtype=torch.float64)[:, max(positive, negative)]
+        along, axis = along if negative < 0 else -along, int((along.abs() * free).argmax())
+        free[axis] = 0
+        found.append(torch.eye(3, dtype=torch.float64)[axis] * along[axis].sign())
+    head, face = found
+    depth = face if front == "far" else -face
+    return torch.stack([depth, -head, torch.linalg.cross(depth, -head)])
 
 
 def _unmirrored(volume: Volume, front: str) -> Volume:

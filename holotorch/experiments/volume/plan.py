@@ -29,6 +29,7 @@ _FEW_VALUES = 0.01  # share of the range of a volume below which points hardly l
 _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
 _DENSE, _STEEP = 0.5, 0.1  # opacity of a surface, and the part of the range of values within which it rises to that
 _SIDES = {"L": "left", "R": "right", "A": "front", "P": "back", "S": "head", "I": "feet"}  # of a patient
+_END = {"far": "far from", "near": "near"}
 _OPPOSITE = str.maketrans("LRAPSI", "RLPAIS")
 _SAME_SIZE = 0.01  # logarithm of a ratio of sizes below which they are the same
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
@@ -114,7 +115,7 @@ def _evaluation_seconds(experiment: VolumeExperiment, machine: Machine) -> dict[
 
 
 def viewpoint(experiment: VolumeExperiment) -> str:
-    """Directions of the file's coordinates towards the observer, upwards and to the right, in words."""
+    """Sides of a patient towards the observer, upwards and to the right, in words; else directions of the file."""
     observer = 1.0 if experiment.settings.view.front == "far" else -1.0  # sign of his direction along depths
     # The rows of the scene, (z, y, x), each as a direction (z, y, x) of the file.
     scene = experiment.rotation @ torch.tensor(experiment.volume.orientation, dtype=torch.float64)
@@ -123,7 +124,10 @@ def viewpoint(experiment: VolumeExperiment) -> str:
         k = int(direction.abs().argmax())
         about = "about " if direction[k].abs() < 0.99 else ""
         reverse = bool(direction[k] < 0)
-        names.append(f"{about}{'-' * reverse}{'zyx'[k]}{_side(experiment.volume.frame, k, reverse=reverse)}")
+        side = _side(experiment.volume.frame, k, reverse=reverse)
+        names.append(about + (f"the {side}" if side else f"{'-' * reverse}{'zyx'[k]}"))
+    if _side(experiment.volume.frame, 0, reverse=False):
+        return "from {} of a patient, with {} up and {} to the right, as the file names its sides".format(*names)
     text = "from {} in the coordinates of its file, with {} up and {} to the right".format(*names)
     source = experiment.settings.volume
     if source.path and not experiment.volume.frame and not source.left_handed:
@@ -132,10 +136,9 @@ def viewpoint(experiment: VolumeExperiment) -> str:
 
 
 def _side(frame: str, axis: int, *, reverse: bool) -> str:
-    """The side of a patient that an axis of the file (0 for z, 1 for y, 2 for x) points to, in brackets if known."""
+    """The side of a patient that an axis of the file (0 for z, 1 for y, 2 for x) points to; empty if unknown."""
     letter = frame[2 - axis] if frame else ""
-    name = _SIDES.get(letter.translate(_OPPOSITE) if reverse else letter, "")
-    return f" ({name})" if name else ""
+    return _SIDES.get(letter.translate(_OPPOSITE) if reverse else letter, "")
 
 
 def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
@@ -151,8 +154,8 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         f"{_resized(experiment)}",
         f"View       {viewpoint(experiment)}",
         f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
-        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end towards the observer, "
-        f"{values['samples']} sample(s) of the volume for each; predicted error of the rendering: "
+        f"from {nearest:.4g} to {farthest:.4g} mm, the end {_END[settings.view.front]} the hologram towards the "
+        f"observer, {values['samples']} sample(s) of the volume for each; predicted error of the rendering: "
         f"{100 * values['slab_error']:.2g} %",
         f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um; field of view "
         f"{', '.join(f'{angle:.2f}' for angle in physics['field_of_view_deg'])} deg",
@@ -217,10 +220,15 @@ def preset_note(experiment: VolumeExperiment) -> str:
     # The part of the histogram that is hidden lies between its threshold, low, and the first value that shows.
     preset, shown = experiment.settings.transfer.preset, (low + hidden) / 2
     lower = low - (hidden - shown) * (high - low) / (high - hidden)
-    return (
+    note = (
         f"the preset {preset} lies between {low:.3g} and {high:.3g}, from the histogram, and shows nothing of values "
-        f"below {hidden:.3g}: look at it with holotorch check --preview; values from {shown:.3g} on, for example, are "
-        f"shown by 'transfer={{preset: {preset}, low: {lower:.3g}, high: {high:.3g}}}'"
+        f"below {hidden:.3g}: look at it with holotorch check --preview"
+    )
+    if lower >= low:
+        return note
+    return (
+        f"{note}; it begins above its low, so that values from {shown:.3g} on, for example, are shown by "
+        f"'transfer={{preset: {preset}, low: {lower:.3g}, high: {high:.3g}}}'"
     )
 
 

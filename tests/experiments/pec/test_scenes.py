@@ -304,11 +304,28 @@ def test_heat_beyond_the_table_of_a_measured_kernel_is_tried(tmp_path):
     assert "if the rise falls on beyond it" in (tmp_path / "run" / "report.html").read_text()
 
 
+def test_a_table_whose_opposite_taps_differ_is_tried_with_their_means(tmp_path):
+    kernel = array.spread(np.pad([[1.0]], 2), 0.66, 5)
+    kernel += 0.05 * kernel * (1 - kernel) * np.random.default_rng(2).normal(size=kernel.shape)
+    np.save(tmp_path / "kernel.npy", kernel)
+    assert execute(settings(f"modulator={{kernel: {tmp_path / 'kernel.npy'}}}", "frames=2"), tmp_path / "run")[1]
+    corrected = json.loads((tmp_path / "run" / "summary.json").read_text())["methods"]["corrected"]
+    numbers = corrected["kernel_even"]
+    assert numbers["noise"] == pytest.approx(np.sqrt(((kernel - kernel[::-1, ::-1]) ** 2).mean() / 2), rel=1e-5)
+    phase, target = (np.load(tmp_path / "run" / "arrays" / f"{name}.npy") for name in ("phase", "target"))
+    means = (kernel + kernel[::-1, ::-1]) / 2
+    heat = [[convolve(one, means, mode="constant") for one in frame] for frame in phase.astype(float)]
+    formed = seen(array.far(np.exp(1j * np.array(heat)))) * target.mean((1, 2), keepdims=True)
+    wanted = np.mean([array.psnr(formed[c], target[c]) for c in range(3)])
+    assert numbers["psnr_mean"] == pytest.approx(wanted, rel=1e-5) and wanted < corrected["psnr_mean"]
+    assert "if heat spreads as their means" in (tmp_path / "run" / "report.html").read_text()
+
+
 def test_a_table_that_holds_the_heat_is_not_continued(tmp_path):
     np.save(tmp_path / "kernel.npy", array.spread(np.pad([[1.0]], 3), 0.66, 7))
     assert execute(settings(f"modulator={{kernel: {tmp_path / 'kernel.npy'}}}"), tmp_path / "run")[1]
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert "kernel_continued" not in summary["methods"]["corrected"]
+    assert not {"kernel_continued", "kernel_even"} & set(summary["methods"]["corrected"])
 
 
 def test_pictures_of_fewer_frames_or_too_much_heat_say_so(tmp_path, monkeypatch):

@@ -7,8 +7,10 @@ import torch
 from holotorch.experiments.planning.heat_kernel import (
     continued,
     cut_off_note,
+    even,
     heat_beyond,
     is_cut_off,
+    opposite_noise,
     response_note,
 )
 
@@ -53,3 +55,17 @@ def test_a_phase_per_kelvin_without_its_wavelength_is_noted_where_there_is_no_li
     assert (
         response_note({"rad_per_K"}, "modulator", [630e-9, 520e-9]) == response_note(set(), "modulator", [5e-7]) == []
     )
+
+
+@pytest.mark.parametrize("size", [(7, 7), (5, 9)])
+def test_the_noise_of_opposite_taps_is_that_of_each(size):
+    """Of the same noise in every tap, and of one in proportion to the rise, which the cold ring does not show."""
+    kernel = rises(*size).double()
+    assert opposite_noise(kernel) == 0 and torch.equal(even(kernel), kernel)
+    noise = torch.randn(200, *size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    noise[:, size[0] // 2, size[1] // 2] = 0
+    for each in (1e-3 * noise, 0.02 * kernel * noise):
+        found = torch.tensor([opposite_noise(kernel + one) for one in each])
+        assert float(found.square().mean().sqrt()) == pytest.approx(float(each.square().mean().sqrt()), rel=0.15)
+    uneven = kernel + 0.02 * kernel * noise[0]
+    torch.testing.assert_close(even(uneven), (uneven + uneven.flip((0, 1))) / 2, rtol=0, atol=0)

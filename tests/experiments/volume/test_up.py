@@ -10,6 +10,7 @@ import torch
 from paths import CONFIGS
 
 from holotorch.cli import main
+from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.volume.experiment import VolumeExperiment, build
 from holotorch.experiments.volume.plan import viewpoint
@@ -84,10 +85,9 @@ def test_an_observer_sees_the_body_and_not_its_mirror_image(flipped, tmp_path):
     around = lump(scanned(tmp_path, "view.azimuth_deg=180", flipped=flipped).rendering()[0])
     assert around == near
     text = viewpoint(scanned(tmp_path, "view.front=near", flipped=flipped))
-    signs = ("", "-") if turned else ("-", "")
     sides = ("back", "right") if turned else ("front", "left")
-    words = "from {}y ({}) in the coordinates of its file, with z (head) up and {}x ({}) to the right"
-    assert text == words.format(signs[0], sides[0], signs[1], sides[1])
+    words = "from the {} of a patient, with the head up and the {} to the right, as the file names its sides"
+    assert text == words.format(*sides)
     stated = scanned(tmp_path, "volume.left_handed=true", flipped=flipped)
     assert "guess" not in viewpoint(stated)
 
@@ -95,12 +95,30 @@ def test_an_observer_sees_the_body_and_not_its_mirror_image(flipped, tmp_path):
 def test_directions_without_names_and_files_without_directions(tmp_path):
     """Axes named by a scanner point to no side of a patient that is known; slices state nothing."""
     named = viewpoint(scanned(tmp_path, "view.front=near", space="scanner-xyz"))
-    assert "guess" not in named and "(" not in named
+    assert named == "from y in the coordinates of its file, with z up and -x to the right"
     np.save(tmp_path / "body.npy", np.zeros((4, 4, 4), np.uint8) + np.arange(4, dtype=np.uint8))
     words = [f"volume={{path: {tmp_path / 'body.npy'}, spacing: 1 mm}}", MARKED]
     hologram = "hologram={shape: [48, 48], pitch: 8 um, distance: 4 mm, depths: 24}"
     unknown = build(load_config(CONFIGS / "volume" / "hand.yaml", [*words, hologram]))
     assert "left and right are a guess" in viewpoint(unknown)
+
+
+@pytest.mark.parametrize("front", ["far", "near"])
+@pytest.mark.parametrize("flipped", [None, 0, 1, 2])
+@pytest.mark.parametrize("space", [LPS, "right-anterior-superior", "left-anterior-superior"])
+def test_a_patient_stands_upright_and_faces_the_observer(front, flipped, space, tmp_path):
+    """However the file holds the voxels; the last space has the body's left for its right, and a left-handed frame."""
+    words = ("view.up=head", f"view.front={front}")
+    assert lump(scanned(tmp_path, *words, flipped=flipped, space=space).rendering()[0])[::2] == ("red", "high")
+    turned = scanned(tmp_path, *words, "view.azimuth_deg=180", flipped=flipped, space=space)
+    assert lump(turned.rendering()[0])[0] == "green"
+    text = viewpoint(scanned(tmp_path, *words, flipped=flipped, space=space))
+    assert text.startswith("from the front of a patient, with the head up and the left to the right")
+
+
+def test_a_head_that_is_not_known_is_asked_for(tmp_path):
+    with pytest.raises(ConfigError, match="head is known for files that say how a patient lies .* -y, y, z"):
+        scanned(tmp_path, "view.up=head", space="scanner-xyz")
 
 
 def test_a_left_handed_space_is_known(tmp_path):
