@@ -67,7 +67,8 @@ class CameraSettings(Settings):
     """A camera; see ``Camera``.
 
     ``distortion``: k1, k2, p1, p2, k3 in OpenCV's order. ``size``: rows and columns of its frames.
-    ``tone``: srgb, linear, or a list of the linear intensity (0 to 1) of each of the 256 grey levels.
+    ``tone``: srgb, linear, or a list of the linear intensity (0 to 1) of each of the 256 grey levels. ``shutter``:
+    rolling, as of most webcams, which read a frame row after row; global if all rows are exposed at the same time.
     """
 
     fx: Positive
@@ -77,6 +78,7 @@ class CameraSettings(Settings):
     distortion: Annotated[tuple[Number, ...], Field(min_length=5, max_length=5)] = (0.0, 0.0, 0.0, 0.0, 0.0)
     size: tuple[Side, Side] | None = None
     tone: Annotated[str | tuple[Number, ...], BeforeValidator(_tone)] = "srgb"
+    shutter: Literal["rolling", "global"] = "rolling"
     calibration: EvidenceSettings | None = None
 
 
@@ -207,7 +209,12 @@ def headset_covariance(settings: HeadsetSettings) -> torch.Tensor | None:
     return None if settings.covariance is None else torch.tensor(settings.covariance, dtype=torch.float64)
 
 
-def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
+def save_camera(
+    path: Path,
+    camera: Camera | Calibration,
+    size: tuple[int, int] | None = None,
+    shutter: Literal["rolling", "global"] = "rolling",
+) -> None:
     """Write a camera, or a calibration with its quality. ``size`` (H, W) in pixels is only used for a ``Camera``."""
     evidence = None
     if isinstance(camera, Calibration):
@@ -221,9 +228,11 @@ def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] 
         distortion=tuple(camera.distortion.detach().tolist()),
         size=size,
         tone=camera.tone if isinstance(camera.tone, str) else tuple(camera.tone.tolist()),
+        shutter=shutter,
         calibration=evidence,
     )
-    _write(path, "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns.", settings)
+    words = "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns; shutter: rolling or global."
+    _write(path, words, settings)
 
 
 def save_tone(path: Path, settings: CameraSettings, tone: torch.Tensor) -> None:

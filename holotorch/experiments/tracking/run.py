@@ -46,7 +46,7 @@ from holotorch.io.bundled import find_config
 from holotorch.io.files import append, replacing, without_nan, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
-from holotorch.tracking import Pose, Status
+from holotorch.tracking import CatheterTracker, Pose, Status
 from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.detection.ends import shows_beyond_tip
 from holotorch.tracking.pose.alignment import in_frame
@@ -171,7 +171,7 @@ def _check_synthetic(settings: TrackSettings) -> None:
 
 
 def _open(settings: TrackSettings, source: str | Path) -> TrackingInputs:
-    return open_inputs(source, *_files(settings), settings.method, settings.rate_hz)
+    return open_inputs(source, *_files(settings), settings.method, settings.rate_hz, still=settings.still)
 
 
 def _files(settings: TrackSettings) -> tuple[Path | None, Path | None]:
@@ -195,6 +195,12 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     count = "without end; Ctrl-C ends it" if frames.live else count
     lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
     lines.append(range_text(experiment.inputs.camera, experiment.inputs.catheter))
+    if isinstance(experiment.inputs.tracker, CatheterTracker) and (readout := experiment.inputs.tracker.readout):
+        lines.append(
+            f"Shutter    deviations (sd) allow for a catheter that moves by {1e3 * readout:g} mm while a rolling "
+            "shutter reads a frame; `shutter: global` in the camera's file, or still=true for one at rest, leaves "
+            "that out"
+        )
     if settings.frames != FRAMES:
         lines.append(
             f"Note       frames={settings.frames} is for synthetic recordings; of this source, all are tracked"

@@ -14,6 +14,7 @@ from holotorch.io.video import Frames, is_camera, no_such_source, open_frames
 from holotorch.tracking import Camera, Catheter, CatheterTracker, ChannelOrder, Pose, ThesisTracker
 from holotorch.tracking.camera.calibration import SURE
 from holotorch.tracking.detection.channels import ambiguities, ambiguity_text
+from holotorch.tracking.pose.rolling_shutter import READOUT
 
 # Largest distance of a principal point from the centre of the frame, as a share of the frame's side. For frames of 720
 # rows and a camera calibrated for 1080 rows, or vice versa, the distance is a sixth or more.
@@ -35,7 +36,13 @@ class TrackingInputs(NamedTuple):
 
 
 def open_inputs(
-    source: str | Path, camera: Path | None, catheter: Path | None, method: str, rate: float | None
+    source: str | Path,
+    camera: Path | None,
+    catheter: Path | None,
+    method: str,
+    rate: float | None,
+    *,
+    still: bool = False,
 ) -> TrackingInputs:
     """Open a source and its YAML files, and create a tracker for it.
 
@@ -45,6 +52,7 @@ def open_inputs(
         catheter: YAML file; by default the one beside the recording.
         method: "ours" or "thesis".
         rate: Frames per second of a source without time stamps.
+        still: Whether the catheter rests, so that a rolling shutter does no harm.
 
     Raises:
         ConfigError: An input cannot be used, or the inputs do not fit together.
@@ -65,7 +73,8 @@ def open_inputs(
         raise ConfigError(missing)
     lens, tool = _loaded(paths)
     model = devices.build_camera(lens)
-    tracker = fitting_tracker(method, model, tool, paths["catheter.yaml"])
+    readout = 0.0 if still or lens.shutter == "global" else READOUT
+    tracker = fitting_tracker(method, model, tool, paths["catheter.yaml"], readout)
     try:
         frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
     except ValueError as error:
@@ -108,24 +117,29 @@ def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, Catheter]:
     return loaded[0], devices.build_catheter(loaded[1])
 
 
-def fitting_tracker(method: str, camera: Camera, catheter: Catheter, path: Path | None) -> Tracker:
+def fitting_tracker(
+    method: str, camera: Camera, catheter: Catheter, path: Path | None, readout: float = READOUT
+) -> Tracker:
     """:func:`make_tracker`, with a ConfigError for unsuitable colours at their line in ``path``, the catheter's file.
 
     Without a file, the catheter is the one of the thesis.
     """
     try:
-        return make_tracker(method, camera, catheter)
+        return make_tracker(method, camera, catheter, readout)
     except ValueError as error:
         if path is None:
             raise ConfigError([f"the camera does not suit the catheter of the thesis: {error}"]) from None
         raise devices.misfit(path, error) from None
 
 
-def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
-    """Create the tracker of a method. Raises ValueError if the method cannot distinguish the catheter's colours."""
+def make_tracker(method: str, camera: Camera, catheter: Catheter, readout: float = READOUT) -> Tracker:
+    """Create the tracker of a method. Raises ValueError if the method cannot distinguish the catheter's colours.
+
+    ``readout`` is that of :class:`CatheterTracker`.
+    """
     if method == "thesis":
         return ThesisTracker(camera, catheter)
-    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # all sources deliver RGB
+    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB, readout=readout)  # all sources deliver RGB
 
 
 def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:

@@ -159,7 +159,7 @@ def _render(folder: Path, poses: Sequence[tuple[Tensor, Tensor]], world: World, 
     rows = []
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
         copies = {name: Path(temporary, name) for name in ("camera.yaml", "catheter.yaml")}
-        devices.save_camera(copies["camera.yaml"], world.camera, size)
+        devices.save_camera(copies["camera.yaml"], world.camera, size, "global")
         devices.save_catheter(copies["catheter.yaml"], tool)
         movie = replacing_video(folder / VIDEO, size, RATE) if video else nullcontext()
         with Recorder(folder, size, RATE, "synthetic", copies) as recorder, movie as writer:

@@ -12,6 +12,7 @@ import pytest
 import torch
 from stand_in import track
 
+from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking import run as tracking_run
 from holotorch.experiments.tracking import synthetic
@@ -37,6 +38,7 @@ from holotorch.experiments.tracking.synthetic import (
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.rolling_shutter import READOUT
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
 SIZE = (540, 960)
@@ -131,6 +133,29 @@ def test_a_run_of_a_synthetic_recording_holds_its_errors(folder, tmp_path):
     page = (out / "report.html").read_text()
     assert "not known here" not in page and f"{found['p95_mm']:.3f}" in page and "95 % ellipsoid" in page
     assert "<td>stability</td>" not in page
+
+
+@pytest.mark.parametrize(
+    ("shutter", "words", "motion"),
+    [("global", [], False), ("rolling", [], True), ("rolling", ["still=true"], False)],
+)
+def test_only_what_moves_before_a_rolling_shutter_is_less_sure(folder, tmp_path, capsys, shutter, words, motion):
+    """A synthetic recording says that its shutter is global; a file without that word means a rolling one."""
+    text = (folder / "camera.yaml").read_text()
+    assert "\nshutter: global\n" in text
+    camera = tmp_path / "camera.yaml"
+    camera.write_text(text if shutter == "global" else text.replace("shutter: global\n", ""))
+    out = tmp_path / "run"
+    assert main(["track", str(folder), "--camera", str(camera), "--out", str(out), "video=false", *words]) == 0
+    assert ("Shutter    deviations" in capsys.readouterr().out) is motion
+    with open(out / "poses.csv", newline="") as stream:
+        variances = [sum(float(pose[f"cov_{axis}{axis}_m2"]) for axis in "xyz") for pose in csv.DictReader(stream)]
+    known, catheter = load_camera(folder / "camera.yaml"), load_catheter(folder / "catheter.yaml")
+    tracker = CatheterTracker(build_camera(known), build_catheter(catheter), readout=READOUT * motion)
+    with open_recording(folder) as frames:
+        first = next(iter(frames)).pixels
+    assert first is not None
+    assert variances[0] == pytest.approx(float(tracker(first[None])[0].tip_sd) ** 2, rel=1e-9)
 
 
 @pytest.mark.parametrize(("offset", "wrong"), [(0.0, False), (-6e-3, True)])
