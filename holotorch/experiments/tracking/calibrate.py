@@ -118,10 +118,11 @@ def parse_board(arguments: Sequence[str]) -> Chessboard | Charuco:
 
 
 def _side(text: str) -> float:
-    """A side in metres. ValueError for a number without a unit that is a usual side only in millimetres."""
+    """A side in metres. ValueError for a number of metres that is a usual side only in millimetres."""
     side = float(metres(text))
-    if BOARD_SQUARE.problem(side) and not re.search(r"[a-zµμ]$", text) and not BOARD_SQUARE.problem(side / 1000):
-        raise ValueError(f"{text} means metres: did you mean {text}mm?")
+    plain = re.fullmatch(r"([\d.]+)m?", text)
+    if plain and BOARD_SQUARE.problem(side) and not BOARD_SQUARE.problem(side / 1000):
+        raise ValueError(f"{text} means metres: did you mean {plain[1]}mm?")
     return side
 
 

@@ -192,6 +192,7 @@ def test_boards_by_their_words():
         ("chess 9x6 25mm", "chessboard 9x6 25mm"),
         ("chessboard 9 25mm", "expected chessboard"),
         ("chessboard 9x6 25", "--board: 25 means metres: did you mean 25mm?"),
+        ("chessboard 9x6 25m", "--board: 25m means metres: did you mean 25mm?"),
         ("charuco 5x7 40mm 20 DICT_6X6_250", "--board: 20 means metres: did you mean 20mm?"),
         ("chessboard 9x6 -25mm", "--board: square must be above zero in metres, got -0.025"),
         ("chessboard 9x6 25foot", "expected a length"),
