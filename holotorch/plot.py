@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 QUANTITIES = ("amplitude", "phase", "intensity", "colour")
+_FAINT = 1e-5  # amplitude, of the largest one, below which phases are mostly rounding
 _MOST = 24  # largest number of panels
 
 
@@ -27,8 +28,9 @@ def show(
     Args:
         values: Complex fields or real values, on any device.
         grid: Sampling, for axes in millimetres; by default the axes count pixels.
-        what: "amplitude", "phase", "intensity" or "colour", or several of them. "colour" takes three channels as linear
-            red, green and blue. By default amplitude and phase of a complex field, and the intensity of real values.
+        what: "amplitude", "phase", "intensity" or "colour", or several of them. "phase" is blank where the light is
+            fainter than 1e-10 of the brightest. "colour" takes three channels as linear red, green and blue. By default
+            amplitude and phase of a complex field, and the intensity of real values.
         names: Titles of the columns, one for each.
 
     Returns:
@@ -72,8 +74,11 @@ def _panels(name: str, values: Tensor) -> Tensor:
     if name in ("amplitude", "phase"):
         if not values.is_complex():
             raise ValueError(f"{name} needs a complex field, got {values.dtype}")
-        values = values.abs() if name == "amplitude" else torch.angle(values)
-        return values.reshape(-1, *values.shape[-2:])
+        values = values.reshape(-1, *values.shape[-2:])
+        size = values.abs()
+        if name == "amplitude":
+            return size
+        return torch.where(size > _FAINT * size.amax((-2, -1), keepdim=True), torch.angle(values), math.nan)
     light = intensity(values) if values.is_complex() else values
     if name == "intensity":
         return light.reshape(-1, *light.shape[-2:])
@@ -83,6 +88,8 @@ def _panels(name: str, values: Tensor) -> Tensor:
 
 
 def _draw(figure: "Figure", axes, name: str, values: Tensor, grid: Grid | None) -> None:
+    from matplotlib import colormaps
+
     extent = None
     if grid is not None:
         (height, width), (y, x) = grid.shape, (1e3 * pitch for pitch in grid.pitch)
@@ -93,6 +100,9 @@ def _draw(figure: "Figure", axes, name: str, values: Tensor, grid: Grid | None) 
         encoded = tone_map(values.double(), gamma=1 / 2.2).movedim(0, -1)
         axes.imshow(encoded.float().numpy(), extent=extent, interpolation="nearest")
         return
-    options = {"cmap": "twilight", "vmin": -math.pi, "vmax": math.pi} if name == "phase" else {"cmap": "gray"}
+    options: dict[str, Any] = {"cmap": "gray"}
+    if name == "phase":
+        blank = colormaps["twilight"].with_extremes(bad="0.85")
+        options = {"cmap": blank, "vmin": -math.pi, "vmax": math.pi}
     drawn = axes.imshow(values.float().numpy(), extent=extent, interpolation="nearest", **options)
     figure.colorbar(drawn, ax=axes, shrink=0.8, label="rad" if name == "phase" else None)

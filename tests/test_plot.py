@@ -21,6 +21,13 @@ def test_a_field_shows_amplitude_and_phase():
     np.testing.assert_allclose(shown[3], field[1].angle(), rtol=1e-5)
 
 
+def test_phases_without_light_are_blank():
+    field = torch.tensor([[1.0, 1.01e-5j], [0.99e-5j, 0.0]], dtype=torch.complex128)
+    lit, dark = (np.ma.filled(each, np.nan) for each in panels(show(torch.stack([field, 0 * field]), what="phase")))
+    np.testing.assert_allclose(lit, [[0, math.pi / 2], [np.nan, np.nan]], rtol=1e-6)
+    assert np.isnan(dark).all()
+
+
 def test_axes_count_millimetres_from_the_optical_axis():
     figure = show(torch.rand(4, 5), Grid((4, 5), (1e-3, 2e-3)), what="intensity")
     left, right, bottom, top = figure.axes[0].images[0].get_extent()
