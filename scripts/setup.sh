@@ -14,9 +14,22 @@ explain() {  # the last lines of a failed installation, and what they usually me
     if grep -qiE 'no space left|disk quota' "$1"; then
         fail "The disk is full: about 3 GB are needed here for the CPU build of torch, 8 GB for the CUDA build."
     elif grep -qiE 'name resolution|failed to establish|connection|timed out|network is unreachable|proxy' "$1"; then
-        fail "No package index could be reached. Connect to the network, or point pip to a mirror (PIP_INDEX_URL)."
+        fail "A package index could not be reached. Connect to the network, or point pip to a mirror (PIP_INDEX_URL)."
     fi
     fail "Installation failed; the whole output is in $1."
+}
+
+reachable() {  # whether each of these addresses answers, be it with a refusal; pip would retry for each package
+    "$python" - "$@" <<'END'
+import sys, urllib.error, urllib.request
+for address in [given for given in sys.argv[1:] if given.startswith("http")]:
+    try:
+        urllib.request.urlopen(address, timeout=10).close()
+    except urllib.error.HTTPError:
+        pass
+    except OSError as error:
+        sys.exit(f"PIP_EXTRA_INDEX_URL {address} does not answer ({error}); installing without it")
+END
 }
 
 progress() {  # of pip, whose lines come in: signs of life every few seconds
@@ -42,6 +55,8 @@ case "$(cat .venv/stamp 2>/dev/null)" in
     log=$(mktemp "${TMPDIR:-/tmp}/holotorch-install.XXXXXX") || fail "Cannot write a temporary file; is the disk full?"
     echo "Installing into .venv (a few minutes the first time; output in $log)" >&2
     rm -f .venv/stamp
+    # shellcheck disable=SC2086  # several addresses are separated by spaces
+    [ -z "${PIP_EXTRA_INDEX_URL:-}" ] || reachable $PIP_EXTRA_INDEX_URL || unset PIP_EXTRA_INDEX_URL
     pip="-m pip install --disable-pip-version-check -c scripts/constraints.txt"
     {
         "$python" -m venv .venv &&

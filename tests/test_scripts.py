@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -32,8 +33,8 @@ def stand_in(checkout: Path, body: str) -> None:
     path.chmod(0o755)
 
 
-def call(checkout: Path, script: str = "demo.sh", *words: str):
-    environment = {"PATH": str(checkout / "bin"), "TMPDIR": str(checkout), "HOME": str(checkout)}
+def call(checkout: Path, script: str = "demo.sh", *words: str, **variables: str):
+    environment = {"PATH": str(checkout / "bin"), "TMPDIR": str(checkout), "HOME": str(checkout)} | variables
     command = [str(checkout / "bin" / "bash"), f"scripts/{script}", *words]
     return subprocess.run(command, cwd=checkout / "clone", env=environment, capture_output=True, text=True)
 
@@ -61,7 +62,7 @@ exit 0
         (WORKING.replace("PIP", "echo No space left on device; exit 1"), "The disk is full: about 3 GB are needed"),
         (
             WORKING.replace("PIP", "echo Temporary failure in name resolution; exit 1"),
-            "No package index could be reached",
+            "A package index could not be reached",
         ),
         (WORKING.replace("PIP", "echo something else; exit 1"), "Installation failed; the whole output is in"),
     ],
@@ -97,6 +98,17 @@ def test_installs_once_and_again_when_the_constraints_change(checkout):
         stream.write("# changed\n")
     call(checkout, "demo.sh")
     assert installs() == [".", ".[dev]", "."]
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_an_extra_index_that_does_not_answer_is_left_out(checkout, tmp_path, answers):
+    """pip would retry it for every package, for minutes and without a word."""
+    real = f'[ "$1" = - ] && exec {sys.executable} "$@"\n'
+    stand_in(checkout, real + WORKING.replace("PIP", 'echo "extra: $PIP_EXTRA_INDEX_URL" >> ../calls'))
+    index = tmp_path.as_uri() if answers else "http://127.0.0.1:9/whl/cpu"
+    done = call(checkout, PIP_EXTRA_INDEX_URL=index)
+    assert (checkout / "calls").read_text().splitlines()[0] == f"extra: {index if answers else ''}"
+    assert (f"PIP_EXTRA_INDEX_URL {index} does not answer" in done.stderr) is not answers
 
 
 def test_a_long_installation_shows_that_it_goes_on(checkout):

@@ -25,9 +25,12 @@ def write_example(name: str, path: Path) -> None:
     if path.exists():
         raise ConfigError([f"{path} is there already; choose another --out"])
     text = source.read_text(encoding="utf-8").rstrip("\n")
+    head = f"# A configuration of kind {name} to begin with; its values are those of {kind.example}:"
     every = [f"# {line}" for line in keys_text(name).splitlines()]
     try:
-        write_text(path, "\n".join([text, "", "# All keys, their values, [defaults] and meanings:", "#", *every, ""]))
+        write_text(
+            path, "\n".join([head, text, "", "# All keys, their values, [defaults] and meanings:", "#", *every, ""])
+        )
     except OSError as error:
         raise ConfigError([f"cannot write {path}: {error.strerror}; choose another --out"]) from None
 

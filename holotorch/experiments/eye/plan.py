@@ -128,6 +128,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     settings, depths = eye.settings, values["focus_mm"]
     lines = [
         f"Scene      {values['scene']}" + (f" (synthetic: {values['synthetic']})" if values["synthetic"] else ""),
+        f"View       {volume_plan.viewpoint(eye.scene)}",
         f"Display    {settings.display.kind}; eyepiece {values['display']['lens_distance_mm']:.4g} mm from the "
         f"hologram, eye {values['display']['eye_distance_mm']:.4g} mm behind it",
         f"Focus      at {', '.join(f'{depth:.4g}' for depth in depths)} mm, which appear at "

@@ -160,6 +160,6 @@ def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:
     unsure = lens.calibration.deviations.get("fx", 0.0) / lens.fx if lens.calibration else 0.0
     if unsure > SURE:
         frames.notes.append(
-            f"the camera's calibration determines its focal length only to {100 * unsure:.1f} %: tips are as far off "
-            f"along the line of sight, {500 * unsure:.1f} mm at 0.5 m, in all frames alike, besides the deviations"
+            f"the camera's calibration determines its focal length only to {100 * unsure:.1f} %: distances are about "
+            "as far off, in all frames alike, besides the deviations"
         )

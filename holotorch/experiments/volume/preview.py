@@ -16,7 +16,8 @@ _SHARES = (1, 25, 50, 75, 90, 95, 99, 99.9)  # percentiles that are listed
 def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
     """PNG of rendering and histogram, and lines with the percentiles of the values and the visible share."""
     values = experiment.volume.values.detach().flatten()
-    values = values[:: max(1, len(values) // _SAMPLE)].double().cpu()
+    every = max(1, len(values) // _SAMPLE)
+    values = values[::every].double().cpu()
     lowest, chosen, of = values.min(), values, ""
     if 0.5 < (share := (values == lowest).double().mean().item()) < 1:  # air, which would hide all that is in it
         chosen, of = values[values > lowest], f" (of the {100 * (1 - share):.2g} % of voxels above the smallest value)"
@@ -27,7 +28,7 @@ def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
     bright = picture.amax().item()
     picture = in_colour(picture, experiment.settings.wavelengths)
     lines = [
-        f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of}: "
+        f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of}{f', of every {every}th voxel' * (every > 1)}: "
         + ", ".join(f"{level:.6g} at {share:g} %" for share, level in zip(_SHARES, levels, strict=True)),
         f"Visible    {100 * visible:.2g} % of the voxels have an opacity above 0"
         + ("" if bright > 0.02 else "; the rendering is black: move the transfer function to the values of the volume"),

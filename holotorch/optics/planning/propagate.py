@@ -393,9 +393,11 @@ def _constant_kernel(
 def _accept(best: Candidate, tolerance: float) -> None:
     """ValueError or a warning, in the name of the caller's caller, if the best candidate exceeds the tolerance."""
     if best.error > tolerance:
+        farthest = max(y.distance for y, _ in best.scenes)
         text = (
-            f"no method reaches a tolerance of {tolerance:.1e} for noise that fills the described band and window; "
-            f"{best.label} comes to {best.error:.1e}. Describe the content by band= and margin=, or ask for less"
+            f"no method reaches a tolerance of {tolerance:.1e} over {farthest:.3g} m, for noise that fills the "
+            f"described band and window; {best.label} comes to {best.error:.1e}. Describe the content by band= and "
+            "margin=, or ask for less"
         )
         if best.error > _UNUSABLE:
             raise ValueError(text)
