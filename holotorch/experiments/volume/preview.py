@@ -28,7 +28,7 @@ def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
     bright = picture.amax().item()
     picture = in_colour(picture, experiment.settings.wavelengths)
     lines = [
-        f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of}{f', of every {every}th voxel' * (every > 1)}: "
+        f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of}{f', of one voxel in {every}' * (every > 1)}: "
         + ", ".join(f"{level:.6g} at {share:g} %" for share, level in zip(_SHARES, levels, strict=True)),
         f"Visible    {100 * visible:.2g} % of the voxels have an opacity above 0"
         + ("" if bright > 0.02 else "; the rendering is black: move the transfer function to the values of the volume"),
