@@ -236,7 +236,7 @@ def track_section(record: RunRecord) -> list[str]:
     text = f"{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
     text += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
     parts.append(element("p", text + f"Deviations (sd) are the tracker's own estimate: {_STATED}, which adds to them."))
-    parts += [element("p", f"{words.removeprefix('Camera').strip()}.") for words in camera_line(summary)]
+    parts += [element("p", f"Camera: {words.removeprefix('Camera').strip()}.") for words in camera_line(summary)]
     parts += [_truth(summary["truth"])] if "truth" in summary else []
     parts += [element("p", f"Note: {note}.") for note in summary["notes"]]
     parts.append(table(["status", "frames"], [[name, str(count)] for name, count in summary["statuses"].items()]))
