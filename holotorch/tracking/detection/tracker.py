@@ -242,9 +242,8 @@ class CatheterTracker(nn.Module):
                 raise max(refusal, other, key=lambda one: one.status) from None
 
     def _search_lines(self, sampler: Sampler, *, thin: bool) -> Pose:
-        """Pose from the first line that has one; of ``thin`` objects, only the best line is measured."""
         with self._timed("colour"):
-            segments = find_segments(sampler.frame, self.table, thin=thin)[: 1 if thin else None]
+            segments = find_segments(sampler.frame, self.table, thin=thin)
         furthest = Status.OK, ""
         planes = self.lens.undistort(np.array([(segment.start, segment.end) for segment in segments]).ravel())
         for segment, (start, end) in zip(segments, planes.reshape(-1, 2).tolist(), strict=True):

@@ -168,21 +168,6 @@ def test_the_work_for_a_frame_is_bounded(monkeypatch):
     refused(TRACKER(frame[None])[0], Status.INCONSISTENT)
 
 
-def test_of_thin_objects_only_the_best_line_is_measured(monkeypatch):
-    """Of 345 answered tuning frames of the second world, 15 were answered by it, and none by the next ones."""
-    looked = []
-
-    def shown(*given, **named):
-        looked.append(named["thin"])
-        return find(*given, **named)
-
-    find = tracker_module.find_bands
-    monkeypatch.setattr(tracker_module, "find_segments", lambda *_, **__: EMPTY)
-    monkeypatch.setattr(tracker_module, "find_bands", shown)
-    refused(TRACKER(WORLD.desk()[None])[0], Status.NO_AXIS, Status.BANDS_MISSING)
-    assert looked == [False, False, True]
-
-
 @pytest.mark.parametrize(("factor", "status"), [(1.0, Status.OK), (8.0, Status.INCONSISTENT)])
 def test_a_refinement_far_from_the_pose_of_the_edges_is_refused(factor, status):
     """It starts from this pose, and may converge to another one where the background is like an edge."""
