@@ -106,16 +106,14 @@ def _check(options: argparse.Namespace) -> int:
     from holotorch.experiments.registry import load_config
 
     settings = load_config(options.config, options.overrides)
-    from holotorch.experiments.execute import check, emphasised
+    from holotorch.experiments.execute import check, emphasised, write_preview
     from holotorch.experiments.planning.threads import undisturbed
 
     with undisturbed():
         plan = check(settings)
-    print(emphasised(plan.text))
-    if options.preview is not None:
-        from holotorch.experiments.execute import write_preview
-
-        print(write_preview(settings, options.preview))
+        print(emphasised(plan.text))
+        if options.preview is not None:
+            print(write_preview(settings, options.preview))
     if plan.shortage:
         raise ConfigError([plan.shortage])
     return OK

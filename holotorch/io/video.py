@@ -17,6 +17,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.io.formats.decoding import decode
 
+_TEXTS = (".txt", ".nfo", ".diz", ".ans")  # FFmpeg, which OpenCV opens videos with, films these as a terminal would
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}  # four-character code of the codec for each file extension
 _ASSUMED_RATE = 30.0  # Hz; frame rate of sources that state none
@@ -121,6 +122,8 @@ def is_camera(source: str | Path) -> bool:
 def _video(path: Path, rate: float | None) -> Frames:
     import cv2
 
+    if path.suffix.lower() in _TEXTS:
+        raise ValueError(f"{path} is a text, not a video")
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         capture.release()

@@ -11,7 +11,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH, DISTANCE
-from holotorch.scene.volume import IDENTITY, Triple, Volume
+from holotorch.scene.volume import IDENTITY, Triple, Volume, reversed_along
 
 _ON_FACE = 1e-9  # relative margin outside a face of the box within which a ray counts as inside, because of rounding
 
@@ -148,7 +148,7 @@ def upright(volume: Volume, rotation: tuple[Triple, Triple, Triple]) -> tuple[Vo
     if order == [0, 1, 2] and not reverse:
         return volume, rotation
     values = volume.values.permute(order)
-    values = (values.flip(reverse) if reverse else values).contiguous()
+    values = (reversed_along(values, reverse) if reverse else values).contiguous()
     z, y, x = (volume.spacing[j] for j in order)
     # Origin and orientation in the file have no effect on a scene.
     return Volume(values, (z, y, x), volume.unit), IDENTITY

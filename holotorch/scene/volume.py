@@ -90,8 +90,8 @@ class Volume:
         z, y, (a, b, c) = self.orientation
         last = (self.shape[2] - 1) * self.spacing[2]
         origin = self.origin[0] + last * a, self.origin[1] + last * b, self.origin[2] + last * c
-        values = torch.from_numpy(self.values.numpy(force=True)[..., ::-1].copy())  # torch flips no uint16
-        return Volume(values.to(self.values.device), self.spacing, self.unit, origin, (z, y, (-a, -b, -c)), self.frame)
+        values = reversed_along(self.values, (2,))
+        return Volume(values, self.spacing, self.unit, origin, (z, y, (-a, -b, -c)), self.frame)
 
     def value_range(self) -> tuple[float, float]:
         """Smallest and largest value; ValueError if a value is NaN or infinite."""
@@ -150,6 +150,12 @@ class Volume:
         step = max(1, _SLAB // (values.shape[1] * values.shape[2]))
         for start in range(0, values.shape[0], step):
             yield start, _comparable(values[start : start + step])
+
+
+def reversed_along(values: Tensor, axes: Sequence[int]) -> Tensor:
+    """A copy with the order reversed along ``axes``, also of unsigned integers, which torch does not flip."""
+    signed = {torch.uint16: torch.int16, torch.uint32: torch.int32}.get(values.dtype, values.dtype)
+    return values.view(signed).flip(tuple(axes)).view(values.dtype)
 
 
 def _comparable(values: Tensor) -> Tensor:

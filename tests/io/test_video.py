@@ -224,3 +224,11 @@ def test_a_frame_over_which_opencv_stumbles_is_a_problem_of_that_frame(tmp_path,
     monkeypatch.setattr(cv2, "VideoCapture", lambda _: Stumbling([None], [0.0]))
     with pytest.raises(ValueError, match="no frame could be decoded"):
         open_frames(tmp_path / "a.avi")
+
+
+@pytest.mark.parametrize("name", ["kernel.txt", "about.NFO"])
+def test_a_text_is_not_filmed(tmp_path, name):
+    """FFmpeg decodes one as what a terminal would show."""
+    (tmp_path / name).write_text("0.1 0.2\n" * 40)
+    with pytest.raises(ValueError, match=f"{name} is a text, not a video"):
+        open_frames(tmp_path / name)

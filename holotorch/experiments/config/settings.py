@@ -115,7 +115,7 @@ def _missing_unit(kind: Quantity, value: float) -> str:
 
 def _other_unit(kind: Quantity, value: float) -> str:
     """A hint for a length with a unit outside the range: another unit with which the same number is a usual length."""
-    for power, unit in itertools.product((-2, -3, -6, -9), ("um", "mm", "cm", "nm")):
+    for power, unit in itertools.product((-3, -2, -6, -9), ("um", "mm", "cm", "nm")):
         number = value / 10.0**power  # as it was written, if its unit has this power
         if 1 <= number < 1000 and kind.usual[0] <= metres(f"{number:.6g} {unit}") <= kind.usual[1]:
             return f"; did you mean '{number:.6g} {unit}'?"

@@ -35,6 +35,10 @@ def carry_out(config: str, overrides: tuple[str, ...], folder: Path, threads: in
                 import torch
 
                 torch.set_num_threads(threads)
+            else:
+                from holotorch.experiments.planning.threads import undisturbed
+
+                stack.enter_context(undisturbed(resumed=folder))
             from holotorch.experiments.execute import execute
             from holotorch.experiments.registry import load_config
 

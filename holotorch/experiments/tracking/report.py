@@ -200,7 +200,8 @@ def camera_line(summary: dict[str, Any]) -> list[str]:
         return []
     return [
         f"Camera     its calibration adds about {added:.2g} mm (sd) to the tips, the same in all frames, to the "
-        f"{summary['tip_sd_mm']['median']:.2g} mm that the frames leave open (sd in overlay and poses.csv)"
+        f"{summary['tip_sd_mm']['median']:.2g} mm that the frames leave open (sd in the overlay, covariances in "
+        "poses.csv)"
     ]
 
 

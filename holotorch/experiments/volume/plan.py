@@ -262,11 +262,11 @@ def unlit(experiment: VolumeExperiment) -> list[str]:
 
 def _other_values(experiment: VolumeExperiment) -> list[str]:
     """A note if the points of the transfer function hardly lie among the values of the volume."""
-    points, values = experiment.settings.transfer.points, experiment.volume.values
+    points = experiment.settings.transfer.points
     if points is None:
         return []
     first, last = min(point[0] for point in points), max(point[0] for point in points)
-    least, largest = float(values.min()), float(values.max())
+    least, largest = experiment.volume.value_range()
     common = min(last, largest) - max(first, least)
     if 2 * common >= last - first and common >= _FEW_VALUES * (largest - least):
         return []
@@ -322,7 +322,7 @@ def dark_picture(experiment: VolumeExperiment) -> list[str]:
     share = (experiment.quick_rendering(_COARSE, lit=False).amax(0) > _LIT).double().mean().item()
     if share >= _DARK:
         return []
-    low, highest = experiment.settings.transfer.low, float(experiment.volume.values.max())
+    low, highest = experiment.settings.transfer.low, experiment.volume.value_range()[1]
     if low is not None and low >= highest:
         return [
             f"transfer.low {low:g} is not below the largest value of the file, {highest:g}: nothing is visible; leave "

@@ -159,6 +159,7 @@ def test_keys_written_twice_a_thousand_times_are_listed_up_to_fifty(tmp_path):
     ("word", "advice"),
     [
         ("grid.pitch=8mm", "got '8mm'; did you mean '8 um'?"),
+        ("grid.pitch=10mm", "got '10mm'; did you mean '10 um'?"),
         ("grid={shape:32, pitch: 8 um}", "unknown setting; YAML wants a space after the colon, 'shape: 32'"),
     ],
 )

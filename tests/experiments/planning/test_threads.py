@@ -4,9 +4,15 @@ import json
 
 import pytest
 import torch
+from paths import CONFIGS
 
+from holotorch.cli import main
+from holotorch.experiments import execute
 from holotorch.experiments.planning import threads
 from holotorch.experiments.planning.threads import undisturbed
+from holotorch.experiments.sweep.one import carry_out
+
+TINY = ("volume={phantom: shells, samples: 16}", "scale=16", "transfer=bone")
 
 
 @pytest.fixture
@@ -64,3 +70,21 @@ def test_transforms_are_timed():
     before = torch.get_num_threads()
     assert 0 < threads._mean_seconds(before) < 1
     assert threads._fastest(1) == 1
+
+
+def test_a_preview_and_the_runs_of_a_sweep_use_them_too(four, monkeypatch, tmp_path, capsys):
+    """They say so: a check to the terminal, and the run of a sweep to its log."""
+    four[4] = four[3] = four[2] = 160.0
+    counts = []
+
+    def counted(*_):
+        counts.append(torch.get_num_threads())
+        return "look.png"
+
+    monkeypatch.setattr(execute, "write_preview", counted)
+    monkeypatch.setattr(execute, "execute", lambda *_: (tmp_path, bool(counted())))
+    assert main(["check", str(CONFIGS / "volume" / "hand.yaml"), *TINY, "--preview", str(tmp_path / "look.png")]) == 0
+    assert "Threads    1, not 4" in capsys.readouterr().out
+    assert carry_out(str(CONFIGS / "volume" / "hand.yaml"), TINY, tmp_path / "one", None).status == "complete"
+    assert "Threads    1, not 4" in (tmp_path / "one.log").read_text() and not capsys.readouterr().out
+    assert counts == [1, 1] and torch.get_num_threads() == 4

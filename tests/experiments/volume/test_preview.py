@@ -128,3 +128,29 @@ def test_a_picture_refocused_beside_the_scene_is_announced_with_the_scale(capsys
     both = f"{1e3 * inside:.4g} mm, {1e3 * beside:.4g} mm"
     assert f"refocused at {both}, as report.refocus asks (divided by the scale, 4)" in out
     assert f"WARNING report.refocus: {1e3 * beside:.4g} mm (divided by the scale, 4) lies beside the scene" in out
+
+
+@pytest.mark.parametrize("dtype", ["uint16", "uint32", "int16", "float32", "float64"])
+@pytest.mark.parametrize("up", ["z", "-z", "y", "x", "-x"])
+def test_a_scan_of_any_type_is_seen_from_all_sides(tmp_path, capsys, dtype, up):
+    """torch neither flips nor compares some integers, and stands scans upright by reversing axes."""
+    z, y, x = np.mgrid[:20, :18, :16] - np.array([9.5, 8.5, 7.5])[:, None, None, None]
+    values = np.where(z**2 + y**2 + (x / (1.5 + 0.05 * z)) ** 2 < 40, 20000 + 900 * y, 20 + x)
+    np.save(tmp_path / "scan.npy", values.astype(dtype))
+    np.save(tmp_path / "same.npy", values.astype(dtype).astype(np.float64))
+    pictures = []
+    for name in ("scan", "same"):
+        source = f"volume={{path: {tmp_path / name}.npy, spacing: 1, unit: relative}}"
+        experiment = find_kind("volume").build(
+            load_config(TINY[0], [*TINY[1:], source, f"view.up={up}", "transfer=bone"])
+        )
+        pictures.append(experiment.quick_rendering(32))
+    assert float(pictures[1].max()) > 0.05
+    torch.testing.assert_close(pictures[0].double(), pictures[1].double(), rtol=0, atol=2e-3)
+    source = f"volume={{path: {tmp_path / 'scan.npy'}, spacing: 1, unit: relative}}"
+    for transfer, words in (
+        ("{preset: bone, low: 60000, high: 70000}", "not below the largest value of the file"),
+        ("{points: [[0, 1, 1, 1, 0], [255, 1, 1, 1, 0.5]]}", "are they meant for this file?"),
+    ):
+        assert main(["check", *TINY, source, f"view.up={up}", f"transfer={transfer}"]) == 0
+        assert words in capsys.readouterr().out
