@@ -38,6 +38,7 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
         best = max(others, key=others.__getitem__)
         ideal = " (no chip shows such fields)" if best == "random" else ""
         scores.append(f"the best other method, {NAMES[best]}{ideal}: {others[best]:.1f} dB at the corrected foci")
+        scores += _behind(methods)
     poor = []
     if corrected.get("half_psnr", math.inf) < _POOR_PARTS and corrected["stack_psnr"] > _POOR:
         poor.append(
@@ -60,6 +61,17 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
         )
         scores[0] += f", of pictures that are {error:.0%} off the volume"
     return [*notes, f"Result     PSNR {'; '.join(scores)}", *poor, *error_line(summary)]
+
+
+def _behind(methods: dict[str, Any]) -> list[str]:
+    """In words, the views in which another method is ahead of the joint correction, if any."""
+    lines = []
+    for key, where in SETS.items():
+        scores = {name: each[f"{key}_psnr"] for name, each in methods.items() if f"{key}_psnr" in each}
+        best = max(scores, key=scores.__getitem__, default="joint")
+        if "joint" in scores and scores[best] > scores["joint"]:
+            lines.append(f"behind {NAMES[best]} {where}: {scores['joint']:.1f} dB against {scores[best]:.1f}")
+    return lines
 
 
 def _exact(summary: dict[str, Any], scores: dict[str, Any], key: str) -> str:

@@ -228,6 +228,8 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     width = settings.view.width or max(side[0] * hologram.pitch[0], side[1] * hologram.pitch[1])
     if isinstance(hologram.depths, int) and hologram.distance <= width / 2:
         hint = f"a volume {width:.3g} m wide needs more than {width / 2:.3g} m"
+        if settings.view.width and hologram.distance < width / 20:
+            hint += f"; view.width={width:g} means {width:g} m: did you mean '{width:g} mm'?"
         problems.append((("hologram", "distance"), f"expected the whole volume in front of the hologram; {hint}"))
     lengths = (hologram.distance, *(hologram.depths if isinstance(hologram.depths, tuple) else ()))
     if min(lengths) / settings.scale < DEPTH.low:

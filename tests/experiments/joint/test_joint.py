@@ -20,6 +20,7 @@ from holotorch.experiments.joint.config import JointSettings
 from holotorch.experiments.joint.evaluation import errors, evaluate
 from holotorch.experiments.joint.experiment import build
 from holotorch.experiments.joint.methods import Shown, baseline, show
+from holotorch.experiments.joint.names import NAMES
 from holotorch.experiments.joint.report import joint_outcome, joint_section
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import figures
@@ -354,3 +355,15 @@ def test_a_result_names_planes_limit_and_ideal_fields_that_qualify_its_score():
     methods = {"joint": {"stack_psnr": 50.0, "at_limit": True}, "afterwards": {"stack_psnr": 25.0}}
     text = "\n".join(joint_outcome({"methods": methods, "measured_error": 0.05}))
     assert "off the volume" not in text and "limit" not in text and "no chip" not in text
+
+
+def test_a_result_names_the_views_in_which_another_method_is_ahead():
+    methods = {
+        "joint": {"stack_psnr": 43.0, "half_psnr": 30.3, "part_psnr": 26.6},
+        "random": {"stack_psnr": 27.7, "half_psnr": 28.2, "part_psnr": 28.2},
+        "slabs": {"stack_psnr": 23.3, "half_psnr": 31.0, "part_psnr": 21.1},
+    }
+    text = "\n".join(joint_outcome({"methods": methods}))
+    assert f"behind {NAMES['slabs']} through half pupils: 30.3 dB against 31.0" in text
+    assert f"behind {NAMES['random']} through circles: 26.6 dB against 28.2" in text
+    assert "behind" not in "\n".join(joint_outcome({"methods": {"joint": methods["joint"]}}))

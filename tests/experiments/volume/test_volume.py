@@ -235,6 +235,7 @@ def test_an_empty_volume_is_black_and_said_to_be(tmp_path, capsys):
     ("override", "message"),
     [
         ("hologram.distance=50 um", "hologram.distance: expected the whole volume in front of the hologram"),
+        ("view.width=1.9", "needs more than 0.95 m; view.width=1.9 means 1.9 m: did you mean '1.9 mm'?"),
         ("hologram.distance=-3 mm", "hologram.distance: expected a distance above zero"),
         ("hologram.rays=33", "hologram.rays: expected a number that divides the hologram's sides"),
         ("hologram.rays=7", "got 7; 'hologram.rays=null' is one ray per pixel"),
