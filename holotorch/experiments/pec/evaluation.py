@@ -106,7 +106,7 @@ def with_noisy_kernels(experiment: PECExperiment, phase: Tensor, noise: float) -
 
 
 def with_even_kernel(experiment: PECExperiment, phase: Tensor) -> dict[str, Any] | None:
-    """Scores of heater phases [F, C, H, W] where heat spreads alike to opposite sides.
+    """Scores of heater phases [F, C, H, W] where heat spreads equally to opposite sides.
 
     None for a Gaussian kernel, and for a measured one whose opposite taps hardly differ.
     """

@@ -112,8 +112,8 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         lines += colours_in_words("picture", settings.wavelengths)
     if "distance_mm" in physics:
         periodic = f"; the periodic model is alias-free up to {_listed(physics['alias_free_mm'])} mm"
-        far = max(map(abs, physics["distance_mm"])) > physics["resolved_mm"]
-        blurred = ": fine detail is blurred there" if far else ""
+        unresolved = max(map(abs, physics["distance_mm"])) > physics["resolved_mm"]
+        blurred = ": fine detail is blurred there" if unresolved else ""
         lines.append(
             f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot of each colour"
             f"{', at the farthest,' if len(physics['distance_mm']) > 1 else ''} {_listed(physics['spot_um'])} um, "

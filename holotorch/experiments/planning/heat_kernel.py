@@ -15,7 +15,7 @@ _LEAST = 1e-6  # rise of a tap, relative to the centre, whose logarithm is taken
 
 
 def opposite_noise(kernel: Tensor) -> float:
-    """Noise of the taps of a kernel [h, w], relative to its centre, if heat spreads alike to opposite sides.
+    """Noise of the taps of a kernel [h, w], relative to its centre, if heat spreads equally to opposite sides.
 
     It is the larger one of that in all taps and that in the outermost ring.
     """

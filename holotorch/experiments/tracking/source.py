@@ -161,5 +161,5 @@ def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:
     if unsure > SURE:
         frames.notes.append(
             f"the camera's calibration determines its focal length only to {100 * unsure:.1f} %: distances are about "
-            "as far off, in all frames alike, besides the deviations"
+            "as uncertain, with the same error in all frames, besides the deviations"
         )

@@ -375,9 +375,10 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
 
 
 def _facing(volume: Volume, front: str) -> Tensor:
-    """Rotation, for vectors (z, y, x), that stands a patient upright and turns the face to the observer.
+    """Rotation matrix [3, 3], for vectors (z, y, x), by which a patient stands upright and faces the observer.
 
-    It takes axes of the voxels to axes of the scene, so that a scan that was tilted stays so.
+    It takes axes of the voxels to axes of the scene, so that a scan that was tilted stays so. ConfigError if the volume
+    does not say how a patient lies.
     """
     sides = [volume.frame[::-1].find(letter) for letter in "SIAP"]  # axes z, y, x of the file
     if max(sides[:2]) < 0 or max(sides[2:]) < 0:
@@ -387,13 +388,13 @@ def _facing(volume: Volume, front: str) -> Tensor:
                 "this volume does not; give the direction of the voxels that points up: -y, y, z, -z, x or -x"
             ]
         )
-    free, found = torch.ones(3, dtype=torch.float64), []
+    free, axes = torch.ones(3, dtype=torch.float64), []
     for positive, negative in (sides[:2], sides[2:]):
         along = torch.tensor(volume.orientation, dtype=torch.float64)[:, max(positive, negative)]
         along, axis = along if negative < 0 else -along, int((along.abs() * free).argmax())
         free[axis] = 0
-        found.append(torch.eye(3, dtype=torch.float64)[axis] * along[axis].sign())
-    head, face = found
+        axes.append(torch.eye(3, dtype=torch.float64)[axis] * along[axis].sign())
+    head, face = axes
     depth = face if front == "far" else -face
     return torch.stack([depth, -head, torch.linalg.cross(depth, -head)])
 
