@@ -43,7 +43,7 @@ OTHER = Grid((9, 8), (3e-6, 7e-6))
 DEPTHS = (0.21e-3, 0.26e-3)
 RETINAL = Grid((12, 12), 8e-6)
 CONTRACTS = ("second derivatives", "forward mode", "vmap", "copies", "meta", "autocast", "compile", "export")
-BY_LENGTH = "the sizes of the arrays follow from the lengths that are learned; with fixed lengths it does"
+BY_LENGTH = "the sizes of the arrays follow from the lengths that are learned; with fixed lengths these columns are yes"
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class RovamoVirsu(_Law):
 
 # Commonly quoted coefficients for the halves of the visual field; the thesis gives none.
 NASAL, TEMPORAL = RovamoVirsu(0.33, 7e-5), RovamoVirsu(0.29, 1.2e-5)
-SUPERIOR, INFERIOR = RovamoVirsu(0.42, 1.2e-4), RovamoVirsu(0.42, 5.5e-5)
+SUPERIOR, INFERIOR = RovamoVirsu(0.42, 1.2e-4), RovamoVirsu(0.42, 5.5e-5)  # the upper and the lower half
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ class WideDisplay:
         return None if self.arcmin is None else 60 / self.arcmin[1]
 
 
+# Displays for the far periphery, thesis Table 2.1.
 TABLE_2_1 = (
     WideDisplay("Spherical wave holographic display", 80, pitch=3.74e-6, derived=False, year=2017),
     WideDisplay("Stereoscopic factored light field synthesis", 87, 91, arcmin=(4.1, 4.1), year=2015),

@@ -37,6 +37,7 @@ class EqualEfficiencyRow:
         return error_freedom(self.f, self.p, self.freedom, f_step=0.01, p_step=step)
 
 
+# Equal-efficiency scales that the thesis measured, Table 2.2.
 TABLE_2_2 = (
     EqualEfficiencyRow(5, 10, 0.47, -11.04, 3, 7.02, 0.0002),
     EqualEfficiencyRow(5, 20, 0.55, -16.3, 3, 11.96, 4.46e-7),

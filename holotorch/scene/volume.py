@@ -76,7 +76,7 @@ class Volume:
 
     @property
     def extent(self) -> Triple:
-        """Size (z, y, x) in ``unit``: number of samples times spacing."""
+        """Size (z, y, x) in ``unit``, which is the number of samples times the spacing."""
         (depth, height, width), (z, y, x) = self.shape, self.spacing
         return depth * z, height * y, width * x
 

@@ -54,6 +54,6 @@ html_theme = "alabaster"
 html_static_path = [str(FOLDER / "static")]
 html_css_files = ["guide.css"]
 html_title = f"holotorch {version}"
-html_copy_source = html_show_sphinx = False
-html_sidebars = {"**": ["about.html", "searchfield.html", "navigation.html", "localtoc.html"]}
+html_copy_source = html_show_sphinx = html_show_copyright = False
+html_sidebars = {"**": ["about.html", "searchfield.html", "navigation.html"]}
 html_theme_options = {"description": "Differentiable optics for VR and AR displays, in PyTorch", "fixed_sidebar": False}

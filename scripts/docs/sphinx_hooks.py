@@ -2,19 +2,26 @@
 
 import re
 import shutil
+import sys
+from enum import Enum
 from functools import lru_cache
 from importlib import import_module
-from inspect import isroutine
+from inspect import getsource, isroutine
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
-from sphinx.addnodes import desc_signature, pending_xref
+from sphinx.addnodes import desc, desc_parameter, desc_signature, pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+from sphinx.ext import autosummary
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import make_refnode
 from sphinx_gallery.scrapers import figure_rst
+
+autosummary.WELL_KNOWN_ABBREVIATIONS += ("Alg.", "Eq.", "Eqs.", "Fig.", "Figs.", "Sec.")  # end no sentence
+
+_SHORT = 26  # letters of a word in code type that fits on a phone's line: it is not broken
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
@@ -22,8 +29,10 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("public-names", PublicNames)
     app.connect("autodoc-process-docstring", escape_formulas, priority=100)  # before napoleon makes markup of it
     app.connect("autodoc-process-signature", shorten_defaults)
+    app.connect("autodoc-process-bases", without_private_bases)
     app.connect("missing-reference", resolve_by_last_name)
     app.connect("doctree-resolved", link_names_in_code_type)
+    app.connect("doctree-resolved", link_pictures)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -47,14 +56,47 @@ class PublicNames(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(lines + self._section(further)))
 
     def _section(self, names: list[str]) -> list[str]:
-        """Table and docstrings of the objects of these full names, as reStructuredText."""
-        lines = [".. autosummary::", "", *(f"   ~{name}" for name in names), ""] if names else []
-        for name in names:
-            found = getattr(import_module(name.rpartition(".")[0]), name.rpartition(".")[2])
-            kind = "class" if isinstance(found, type) else "function" if isroutine(found) else "data"
-            options = {"class": ["   :members:", "   :show-inheritance:"], "data": ["   :no-value:"]}.get(kind, [])
-            lines += [f".. auto{kind}:: {name}", *options, ""]
+        """Table and docstrings of the objects of these full names, and the constants, as reStructuredText."""
+        objects = {name: getattr(import_module(name.rpartition(".")[0]), name.rpartition(".")[2]) for name in names}
+        constants = {name for name, found in objects.items() if not isinstance(found, type) and not isroutine(found)}
+        listed = [f"   ~{name}" for name in names if name not in constants]
+        lines = [".. autosummary::", "", *listed, ""] if listed else []
+        for name, found in objects.items():
+            if name in constants:
+                lines += constant(name, found)
+            else:
+                kind = "class" if isinstance(found, type) else "function"
+                lines += [f".. auto{kind}:: {name}", *(options(found) if isinstance(found, type) else ()), ""]
         return lines
+
+
+def options(found: type) -> list[str]:
+    """Options of autodoc for a class: members, its own call, and the names of an enumeration."""
+    lines = ["   :show-inheritance:"] if any(map(is_public_base, found.__bases__)) else []
+    if not issubclass(found, tuple):  # the fields of a named tuple are in its docstring
+        lines.append("   :members:")
+    if issubclass(found, Enum):
+        lines.append("   :undoc-members:")
+    calls = next((base for base in found.__mro__ if "__call__" in vars(base)), object)
+    if calls.__module__.startswith("holotorch."):
+        lines.append("   :special-members: __call__")
+    return lines
+
+
+def constant(name: str, value: object) -> list[str]:
+    """A constant with its value, if that is short, and the comment beside or above it."""
+    package, _, last = name.rpartition(".")
+    text = ""
+    for module in [each for key, each in sys.modules.items() if key.startswith(package)]:
+        if vars(module).get(last) is value:
+            pattern = rf"((?:^# .*\n)*)^(?:\w+, )*{last}\b[^=\n]*= ([^\n]*)$"
+            if found := re.search(pattern, getsource(module), re.MULTILINE):
+                above = " ".join(line.removeprefix("# ") for line in found[1].splitlines())
+                text = " ".join(filter(None, [above, found[2].partition("  # ")[2]])).strip()
+    short = repr(value) if len(repr(value)) < 100 else ""
+    shown = [f"   :value: {short}"] if short else []
+    text = re.sub(r"([*|])", r"\\\1", text[:1].upper() + text[1:])
+    return [f".. py:data:: {last}", f"   :module: {package}", *shown, "", f"   {text}", ""]
 
 
 def escape_formulas(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
@@ -69,6 +111,16 @@ def shorten_defaults(
 ) -> tuple[str | None, str | None]:
     """Defaults that are no Python, such as ``<factory>`` of a data class, become an ellipsis."""
     return re.sub(r"<[^<>]*>", "...", signature) if signature else signature, returns
+
+
+def without_private_bases(app: Sphinx, name: str, obj: object, options: object, bases: list[type]) -> None:
+    """Bases that no page documents say nothing to a reader."""
+    bases[:] = filter(is_public_base, bases)
+
+
+def is_public_base(base: type) -> bool:
+    """Whether a base class is worth a line."""
+    return base is not object and not getattr(base, "__name__", "").startswith("_")
 
 
 def documented(env: BuildEnvironment) -> dict[str, list[tuple[str, str]]]:
@@ -101,13 +153,34 @@ def link_names_in_code_type(app: Sphinx, tree: nodes.document, page: str) -> Non
     """A public name in code type leads to its docstring, in Markdown as well, which needs no markup for it."""
     places = documented(app.env)
     for literal in list(tree.findall(nodes.literal)):
-        inside = literal.parent
+        if max(map(len, literal.astext().split()), default=0) <= _SHORT:
+            literal["classes"].append("short")
+        inside, name = literal.parent, re.sub(r"\(.*\)$", "", literal.astext())
         while inside is not None and not isinstance(inside, nodes.reference | desc_signature | nodes.title):
+            if isinstance(inside, desc) and name in parameters(inside):
+                break
             inside = inside.parent
-        name = re.sub(r"\(.*\)$", "", literal.astext())
         if inside is None and len(places.get(name, [])) == 1:
             there, anchor = places[name][0]
             literal.replace_self(make_refnode(app.builder, page, there, anchor, literal.deepcopy(), anchor))
+
+
+def parameters(described: desc) -> set[str]:
+    """Names of the parameters of what is described; a docstring means these, not what else is called so."""
+    signatures = [each for each in described.children if isinstance(each, desc_signature)]
+    written = [each.astext() for signature in signatures for each in signature.findall(desc_parameter)]
+    return {re.split("[:=]", text)[0].strip("* ") for text in written}
+
+
+def link_pictures(app: Sphinx, tree: nodes.document, page: str) -> None:
+    """A picture leads to its file, which a browser shows at full size: charts are too fine for the width of a page."""
+    up = "../" * page.count("/")
+    for picture in list(tree.findall(nodes.image)):
+        name = app.env.images.get(picture["uri"], (set(), ""))[1]
+        if name and not isinstance(picture.parent, nodes.reference):
+            link = nodes.reference("", "", refuri=f"{up}_images/{name}", internal=True)
+            picture.replace_self(link)
+            link += picture
 
 
 def picture_of_script(block: Any, values: dict[str, Any], settings: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""A volume is rendered into light sources on planes, those become one hologram, and it is focused at two depths."""
+"""A volume is rendered into light sources on planes, those become one hologram, and it is focused at three depths."""
 
 from pathlib import Path
 

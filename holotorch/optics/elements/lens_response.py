@@ -15,15 +15,16 @@ def lens_taps(
 ) -> Tensor:
     """Weights of one axis from samples q in front of a lens to positions x behind it, without the carrier.
 
-    w(x, q) = int dx' sinc((x' - q) / pitch) exp(-i pi x'^2 / (wavelength focus)) g(x - x'), with the Fresnel kernel
-    g(x) = exp(i pi x^2 / (wavelength z)) / sqrt(i wavelength z). With m = 1 - z / focus, the highest frequency
-    B = 1 / (2 pitch) of the samples and the frequency f0 = (x - m q) / (wavelength z) of the ray from q to x,
+    w(x, q) = integral over x' of sinc((x' - q) / pitch) exp(-i pi x'^2 / (wavelength focus)) g(x - x'), with the
+    Fresnel kernel g(x) = exp(i pi x^2 / (wavelength z)) / sqrt(i wavelength z). With m = 1 - z / focus, the highest
+    frequency B = 1 / (2 pitch) of the samples and the frequency f0 = (x - m q) / (wavelength z) of the ray from q to x,
 
     w = pitch / sqrt(2 wavelength |z|) exp(i pi ((x - q)^2 / z - q^2 / focus) / wavelength) (F(u+) + F(u-)),
 
-    u+- = sqrt(2 wavelength |z / m|) (B -+ f0). F = C - iS for z / m > 0 and C + iS otherwise, times -i sign(z) for
-    m < 0, with the Fresnel integrals C and S. This is ``fresnel_taps`` over z / m at the position x / m, arranged so
-    that all terms are bounded as m -> 0. At m = 0 the weights have a step at abs(x) = wavelength |z| B, with the mean
+    u+ = sqrt(2 wavelength |z / m|) (B - f0), and u- the same with B + f0. F = C - iS for z / m > 0 and C + iS
+    otherwise, times -i sign(z) for m < 0, with the Fresnel integrals C and S. This is ``fresnel_taps`` over z / m at
+    the position x / m, arranged so that all terms are bounded as m -> 0. At m = 0 the weights have a step at
+    abs(x) = wavelength |z| B, with the mean
     value on the step. Near m = 0 this step is a steep edge with large gradients; at m = 0 gradients omit it.
 
     Args:

@@ -19,8 +19,8 @@ class PixelShape(FieldOperator):
 
     Every pixel is a uniformly bright rectangle of ``fill`` times the pitch with dark gaps between. The spectrum of the
     panel repeats with the period 1 / pitch, once for each diffraction order, under the envelope sinc(fill pitch f) per
-    axis. The band |f| < s / (2 pitch) with s = 2 orders + 1 is kept. It contains the orders from -``orders`` to
-    +``orders`` completely and is sampled s times as finely as the panel. The result does not depend on the wavelength,
+    axis. The band |f| < s / (2 pitch) with s = 2 orders + 1 is kept. It contains all orders up to ``orders`` on both
+    sides completely and is sampled s times as finely as the panel. The result does not depend on the wavelength,
     so C is arbitrary.
 
     The amplitude is relative to that of the panel as point sources: a uniform panel of ones has 1 in its zero order,

@@ -13,10 +13,11 @@ from holotorch.optics.free_space.kernels import cycles_phasor, direction_cosine
 def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distance: Tensor) -> Tensor:
     """Weights of the paraxial propagation from a sample to displaced positions on one axis, without the carrier.
 
-    t(n) = pitch * int_{-B}^{B} exp(-i pi wavelength z f^2) exp(2 pi i f n pitch) df with the highest frequency
-    B = 1 / (2 pitch) of the samples. Completing the square gives two Fresnel integrals with the arguments
-    u = sqrt(2 wavelength |z|) (B -+ x / (wavelength |z|)), where x = n pitch. They hold at every distance: at short
-    distances the taps approach a single sample with sinc tails, at long ones the sampled chirp of a point source.
+    t(n) = pitch * integral over f from -B to B of exp(-i pi wavelength z f^2) exp(2 pi i f n pitch), with the highest
+    frequency B = 1 / (2 pitch) of the samples. Completing the square gives two Fresnel integrals with the arguments
+    u = sqrt(2 wavelength |z|) (B - x / (wavelength |z|)), and the same with a plus, where x = n pitch. They hold at
+    every distance: at short distances the taps approach a single sample with sinc tails, at long ones the sampled
+    chirp of a point source.
 
     Args:
         displacement: n in samples, which need not be whole, shape [N].

@@ -42,7 +42,7 @@ def predicted_contrast(spectrum: Spectrum, path_difference: float) -> float:
     """Speckle contrast of a uniformly illuminated round pupil under ``spectrum``, between 0 and 1.
 
     The squared contrast C^2 is the double integral of S(l) S(l') sinc^2(path_difference (l - l') / lambda^2) over the
-    wavelengths l and l', where S is the power density, normalized over the band, and lambda the central wavelength. For
+    wavelengths l and l', where S is the power density, normalised over the band, and lambda the central wavelength. For
     a Lorentzian without cut-off, C^2 = 2 (b - 1 + exp(-b)) / b^2 with b = 2 pi path_difference fwhm / lambda^2; the
     cut-off at 10 % raises C. For a path difference of 0, C is 1.
 

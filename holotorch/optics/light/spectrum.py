@@ -86,7 +86,7 @@ class _Table:
 class Spectrum:
     """Power of a source against wavelength, from :meth:`Spectrum.lorentzian`, ``gaussian``, ``table`` or a preset.
 
-    Power below ``cutoff`` times the peak is dropped, and the remaining band is normalized to unit power, so that images
+    Power below ``cutoff`` times the peak is dropped, and the remaining band is normalised to unit power, so that images
     under different sources are compared at equal power (text below Eq. 5.16).
 
     The presets, such as ``Spectrum.laser(636e-9)``, are Lorentzian with the full widths at half maximum of Table 5.1.
@@ -221,7 +221,7 @@ class Spectrum:
         """Few wavelengths [K] in metres and weights [K], float64, whose weighted sum approximates the integral.
 
         With ``count`` alone the result is Gauss's rule for the power over the band, exact for intensities that are
-        polynomials of the wavelength up to degree 2 K - 1. With ``path_difference``, wavelengths and weights minimize
+        polynomials of the wavelength up to degree 2 K - 1. With ``path_difference``, wavelengths and weights minimise
         the expected error; where many wavelengths are needed, this takes a third fewer than Gauss's rule.
 
         Args:

@@ -135,7 +135,7 @@ def placement(size: float, width: float, pitch: float, wavelength: float, depth:
     """Smallest distance in metres to the centre of a volume whose near face lies in region 3 (:func:`region`).
 
     The result is (V + w) / (2 tan(theta)) + depth / 2, with V = ``size`` and ``depth`` = V by default. The shortest
-    wavelength requires the largest distance; the 157.81 mm of the thesis are for 455 nm.
+    wavelength requires the largest distance; the thesis's 157.81 mm is that of 455 nm.
     """
     widths = checks.quantity(WIDTH, size, "size") + checks.quantity(WIDTH, width)
     depth = size if depth is None else checks.quantity(SPACING, depth, "depth")

@@ -87,7 +87,7 @@ def propagate_elements(
     in the thesis.
 
     Returns:
-        Complex [..., C, H, W], scaled as by ``propagate_collapsed``: the sample at position x of ``grid`` holds the
+        Complex [..., C, H, W], scaled as by ``propagate_collapsed``. The sample at position x of ``grid`` holds the
         field at the position s x on the retina times abs(s), with s from :func:`retinal_scale`. The sum of the
         intensity times both pitches of the hologram is the power in this window of the retina.
 

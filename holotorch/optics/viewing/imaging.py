@@ -128,7 +128,7 @@ def propagate_collapsed(
         factors: Results of :func:`collapse_factors` for these arguments, which are computed by default.
 
     Returns:
-        Complex [..., C, H, W] on ``grid``, upright: a position times :func:`retinal_scale` (negative) is that on the
+        Complex [..., C, H, W] on ``grid``, upright. A position times :func:`retinal_scale` (negative) is that on the
         retina. The sum of the intensity times both pitches is the power on the retina. The curvature and the factor
         exp(ikz), which do not affect the intensity, are omitted.
 

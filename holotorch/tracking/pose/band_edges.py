@@ -66,7 +66,7 @@ def fit_band_edges(
         resting_tip: Whether the tip was in the same place in all frames.
         along_px: Standard deviation of an edge along the tool's image, in pixels.
         across_px: Standard deviation of an edge across the tool's image, in pixels.
-        offset: Distance of the edges from the axis toward the camera, in metres.
+        offset: Distance of the edges from the axis towards the camera, in metres.
 
     Raises:
         TypeError, ValueError: Wrong shapes or types, too few known distances, fewer than 5 frames, parallel directions,
@@ -83,7 +83,7 @@ def fit_band_edges(
     if (spread := widest_angle(poses.direction)) < SAME_DIRECTION:
         raise ValueError(
             f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
-            "every frame has the same faults; tilt it toward the camera and away from it by 20 to 45 degrees"
+            "every frame has the same faults; tilt it towards the camera and away from it by 20 to 45 degrees"
         )
     plane = camera.undistort(pixels).detach()
     visible = torch.ones_like(plane[..., 0], dtype=torch.bool)

@@ -67,4 +67,5 @@ class Catheter:
         return torch.tensor(self.edges, dtype=torch.float64)
 
 
+# The catheter of the thesis, with three bands; lengths in metres.
 THESIS = Catheter((0.070, 0.108, 0.146, 0.184), ((200, 40, 45), (40, 150, 70), (40, 70, 190)), 1.0e-3, 0.35)

@@ -34,7 +34,7 @@ def solve_pose(
         along_px: Standard deviation of a point along the tool's image, in pixels; a number or [B, N].
         across_px: Standard deviation across the tool's image, like ``along_px``.
         seen: [B, N] bool; False excludes a point.
-        offset: Distance of the points from the axis toward the camera, in metres; a number or [B].
+        offset: Distance of the points from the axis towards the camera, in metres; a number or [B].
 
     Returns:
         Poses [B] in float64. A pose that cannot be computed is NaN, and its status gives the reason.
