@@ -135,6 +135,7 @@ def calibration_text(calibration: Calibration, missing: dict[str, str], board: S
     between = f", {math.degrees(coverage.between):.0f} deg between boards at most" if len(calibration.views) > 1 else ""
     photographs = len(calibration.views) + len(calibration.left_out) + len(missing)
     low, high = (math.degrees(angle) for angle in coverage.tilts)
+    near, away = coverage.distances
     lines = [
         f"Camera     {', '.join(parts[:4])} px, for frames of {calibration.size[1]} x {calibration.size[0]} px",
         f"Distortion {', '.join(parts[4:])}",
@@ -143,6 +144,7 @@ def calibration_text(calibration: Calibration, missing: dict[str, str], board: S
         f"Used       {len(calibration.views)} of {photographs} photographs",
         f"Coverage   {100 * coverage.cells:.0f} % of the picture, {100 * coverage.radius:.0f} % of the way to its "
         f"corners, tilts of {low:.0f} to {high:.0f} deg{between}",
+        f"Distance   {near:.2g} to {away:.2g} m from the camera, if the squares are as large as stated",
     ]
     lines += [f"View       {name}: {error:.2f} px" for name, error in calibration.views.items()]
     others = (

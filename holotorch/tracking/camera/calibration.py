@@ -25,19 +25,22 @@ _CELLS = (6, 8)  # rows and columns of the grid of cells that the coverage count
 
 @dataclass(frozen=True)
 class Coverage:
-    """Share of the picture and range of tilts that the views cover.
+    """Share of the picture and ranges of tilts and distances that the views cover.
 
     Attributes:
         cells: Share of the cells of a 6 x 8 grid over the picture that contain at least one corner.
         radius: Largest distance of a corner from the middle of the picture, as a share of half its diagonal.
         tilts: Smallest and largest angle between the normal of a board and the axis of the camera, in radians.
         between: Largest angle between two boards, in radians.
+        distances: Smallest and largest distance of a board's middle from the camera, in the unit of the boards. A wrong
+            size of the squares changes nothing but these.
     """
 
     cells: float
     radius: float
     tilts: tuple[float, float]
     between: float
+    distances: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +257,17 @@ def _coverage(views: Sequence[View], fit: Estimate, size: tuple[int, int]) -> Co
     crossed = np.linalg.norm(np.cross(fit.normals[:, None], fit.normals[None]), axis=-1)
     between = np.arctan2(crossed, np.abs(fit.normals @ fit.normals.T)).max()
     share = len(np.unique(cells, axis=0)) / math.prod(_CELLS)
-    return Coverage(share, float(radius), (float(tilts.min()), float(tilts.max())), float(between))
+    away = [_distance(view, fit) for view in views]
+    tilted = float(tilts.min()), float(tilts.max())
+    return Coverage(share, float(radius), tilted, float(between), (min(away), max(away)))
+
+
+def _distance(view: View, fit: Estimate) -> float:
+    """Distance of a board's middle from the camera, in the unit of its points."""
+    points, pixels = view.points.numpy(), view.pixels.numpy()
+    _, rotation, translation = cv2.solvePnP(points, pixels, camera_matrix(fit.values), fit.values[4:])
+    middle = Rotation.from_rotvec(rotation[:, 0]).apply(points.mean(0)) + translation[:, 0]
+    return float(np.linalg.norm(middle))
 
 
 def _warnings(

@@ -167,7 +167,7 @@ def test_pictures_of_every_kind_are_looked_for_in_a_folder(tmp_path):
 
 def test_photographs_of_one_reason_and_those_that_fit_badly_are_told_in_a_line():
     one = torch.eye(3, dtype=torch.float64)
-    coverage = Coverage(1.0, 1.0, (0.1, 0.7), 0.7)
+    coverage = Coverage(1.0, 1.0, (0.1, 0.7), 0.7, (0.3, 0.6))
     deviations: dict[str, float] = {name: 0.1 for name in PARAMETERS}
     views = {"a.png": 0.16, "b.png": 0.2, "c.png": 0.19}
     found = Calibration(

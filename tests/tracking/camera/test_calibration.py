@@ -149,6 +149,18 @@ def test_coverage_and_warnings_of_few_views_in_the_middle():
     assert seen.between < 4 * 0.35
 
 
+def test_distances_are_those_of_the_boards_and_grow_with_their_squares():
+    views = exact(12)
+    poses = oracle.handheld(12, (0.1, 0.0625), 1.0, 0.7, 0)
+    middles = [oracle.rotation(r) @ view.points.mean(0).numpy() + t for view, (r, t) in zip(views, poses, strict=True)]
+    truth = np.linalg.norm(middles, axis=-1)
+    found = calibrate(views, SHAPE).coverage.distances
+    # The focal length, known to 0.5 %, decides on the distances.
+    assert found == pytest.approx((truth.min(), truth.max()), rel=0.02)
+    larger = calibrate([View(10 * view.points, view.pixels, view.name) for view in views], SHAPE).coverage
+    assert larger.distances == pytest.approx([10 * each for each in found], rel=1e-4)
+
+
 def test_no_views_are_refused():
     with pytest.raises(ValueError, match="needs photographs that show the board.*got none"):
         calibrate([], SHAPE)
