@@ -1,15 +1,19 @@
 """One static HTML page for one or more run folders."""
 
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.registry import KINDS, find_kind
 from holotorch.experiments.runs.page import page, plain, render
 from holotorch.experiments.runs.record import SUMMARIES, RunRecord
 from holotorch.io.files import read_json, write_text
+
+_NAMED = 3  # runs that the title of a page names
 
 
 def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | None = None) -> None:
@@ -24,7 +28,7 @@ def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | 
         parts += find_kind(name).comparison(same_kind) if len(same_kind) > 1 else []
     parts += [section for _, section in runs]
     parts += [render("links", more)] if more else []
-    title = "holotorch: " + (runs[0][0].title if len(runs) == 1 else f"{len(runs)} runs")
+    title = "holotorch: " + (", ".join(run.title for run, _ in runs) if len(runs) <= _NAMED else f"{len(runs)} runs")
     write_text(path, page(title, "\n".join(parts)))
 
 
@@ -59,9 +63,14 @@ def _read(folder: Path) -> tuple[RunRecord, str]:
             kinds = f"only those of {', '.join(KINDS)} can be shown together"
             raise ConfigError([f"{folder} holds a run of kind {run.kind}, and {kinds}{hint}"])
         run.load()
-        environment = [[key, plain(value)] for key, value in run.env.items()]
+        environment = [[key, _environment(key, value)] for key, value in run.env.items()]
         repeat = render("repeat", f"holotorch run {run.folder / 'config.yaml'}", run.config, environment)
         return run, "\n".join([*find_kind(run.kind).section(run), repeat])
+
+
+def _environment(key: str, value: Any) -> str:
+    """A value of env.json as text; the command as a shell takes it."""
+    return shlex.join(map(str, value)) if key == "command" and isinstance(value, list) else plain(value)
 
 
 @contextmanager

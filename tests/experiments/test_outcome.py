@@ -31,7 +31,7 @@ def wanted(kind: str, summary: dict) -> list[str]:
         methods = summary["methods"]
         stack, half = (methods["joint"][f"{name}_psnr"] for name in ("stack", "half"))
         return [
-            f"PSNR {stack:.1f} dB at the corrected foci",
+            f"dB by exact heat and light ({stack:.1f} dB by the run's own calculation) at the corrected foci",
             f"; {half:.1f} dB through half pupils",
             f"hottest pixel {methods['joint']['peak_temperature_K']:.0f} degC above ambient",
             f": {max(methods[name]['stack_psnr'] for name in ('afterwards', 'slabs')):.1f} dB at",

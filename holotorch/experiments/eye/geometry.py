@@ -189,7 +189,8 @@ def _draw_display(axes: Any, eye: Observer) -> None:
         axes.plot([end, end], [sign * pupil, sign * max(2.5 * pupil, half)], "k", linewidth=2)
     axes.plot([end + retina] * 2, [-retina / 6, retina / 6], color="0.4", linewidth=3)
     share = axes.get_xaxis_transform()  # heights are fractions of the height of the axes
-    axes.text(end + retina, 0.97, "eye  ", ha="right", va="top", fontsize=8, transform=share)
+    for position, name in ((end, "pupil  "), (end + retina, "retina  ")):
+        axes.text(position, 0.97, name, ha="right", va="top", fontsize=8, transform=share)
     axes.set(xlabel="along the axis (mm from the hologram)", ylabel="height (mm)")
     axes.set_title("display and eye: rays from the scene to the edge of the pupil", fontsize=10)
     axes.grid(alpha=0.3)
@@ -208,7 +209,8 @@ def _draw_regions(axes: Any, eye: Observer) -> None:
     for edge, kind in ((half + cone, 2), (np.maximum(half - cone, 0), 1), (np.maximum(cone - half, 0), 3)):
         axes.fill_between(z, -edge, edge, color=colormaps["Blues"](kind / 4), linewidth=0)
     for name, distance, height in (("I", 0.5 * apex, 0.0), ("II", apex, width / 2), ("III", 1.6 * apex, 0.0)):
-        axes.text(1e3 * distance, 1e3 * height, name, ha="center", va="center")
+        colour = "white" if name == "III" else "black"
+        axes.text(1e3 * distance, 1e3 * height, name, ha="center", va="center", color=colour)
     axes.plot([0, 0], [-1e3 * width / 2, 1e3 * width / 2], "k", linewidth=4)
     _draw_scene(axes, eye)
     axes.set(xlabel="distance from the hologram (mm)", ylabel="height (mm)")

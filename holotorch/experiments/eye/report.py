@@ -11,6 +11,16 @@ _COLOURS = (
     "Colours are those of light of {} nm, mixed to white. The pictures of the volume itself (holotorch check "
     "--preview, kind volume) have the colours of its transfer function as a screen shows them, which differ."
 )
+_COLUMNS = {
+    "focus_mm": "focus (mm)",
+    "wavelengths": "wavelengths of the spectrum",
+    "followed": "of them propagated",
+    "contrast_predicted": "predicted contrast",
+    "ssim": "SSIM",
+    "grain_y": "grain along y",
+    "grain_x": "grain along x",
+    "best_fwhm_nm_by_formula": "best width of the spectrum by formula (nm)",
+}
 _PREDICTED = (
     "The predicted contrast is that of an evenly filled round pupil and fully developed speckle; a scene with "
     "structure has neither and measures lower. Grains are measured in samples of the picture, with the scene divided "
@@ -61,11 +71,11 @@ def eye_section(run: RunRecord) -> list[str]:
     if len(summary["wavelengths_nm"]) == 3:
         parts.append(element("p", _COLOURS.format(" / ".join(f"{each:.0f}" for each in summary["wavelengths_nm"]))))
     first = summary["rows"][0]
-    at = f" at {' / '.join(f'{wavelength:.0f}' for wavelength in summary['wavelengths_nm'])} nm"
-    names = [key.replace("_", " ") + (at if isinstance(first[key], list) else "") for key in first]
+    at = " / ".join(f"{wavelength:.0f}" for wavelength in summary["wavelengths_nm"])
     parts += [element("p", f"Warning: {warning}.", "warn") for warning in plan.get("warnings", [])]
-    parts.append(table(names, [[_cell(value) for value in row.values()] for row in summary["rows"]]))
-    parts.append(element("p", _PREDICTED))
+    cells = [[_cell(value) for value in row.values()] for row in summary["rows"]]
+    parts.append(table([_COLUMNS.get(str(key), str(key).replace("_", " ")) for key in first], cells))
+    parts.append(element("p", f"Where a cell has several values, they are those at {at} nm. {_PREDICTED}"))
     if sentence := error_sentence(summary):
         parts.append(element("p", sentence))
     return [*parts, element("h2", "Plan"), element("pre", plan.get("text", plain(plan)))]
@@ -73,5 +83,5 @@ def eye_section(run: RunRecord) -> list[str]:
 
 def _cell(value: Any) -> str:
     if not isinstance(value, list):
-        return plain(value)
-    return " / ".join("-" if item is None else f"{item:.3g}" for item in value)
+        return plain(value).replace("_", " ")
+    return "\u00a0/\u00a0".join("-" if item is None else f"{item:.3g}" for item in value)

@@ -13,7 +13,14 @@ from holotorch.experiments.joint.budget import PATIENCE, SLABS
 from holotorch.experiments.joint.experiment import JointExperiment
 from holotorch.experiments.joint.methods import Shown, show
 from holotorch.experiments.joint.seconds import shown_seconds, step_seconds
-from holotorch.experiments.planning.correction import HEAT, PROPAGATION, STOPPING, scaled_error, spread_completely
+from holotorch.experiments.planning.correction import (
+    HEAT,
+    NO_STEP,
+    PROPAGATION,
+    STOPPING,
+    scaled_error,
+    spread_completely,
+)
 from holotorch.experiments.planning.errors import LIMIT, Comparison, not_measured
 from holotorch.experiments.planning.machine import Machine, machine_speed
 from holotorch.experiments.volume.measured import relative_error
@@ -96,6 +103,8 @@ def _stopping(experiment: JointExperiment, solution: Solution) -> tuple[float | 
         further = solver(problem, solution.x)
     except ValueError as error:  # the gradient vanishes if the images are exact
         return None, f"not measured: {error}"
+    if torch.equal(further.x, solution.x):  # says nothing about the distance from an optimum
+        return None, NO_STEP
     views = experiment.stack.operator
     with torch.no_grad():
         before, after = (show(experiment, x).images(views) for x in (solution.x, further.x))

@@ -81,7 +81,7 @@ def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
         f"front nearest, {experiment.scene.samples} sample(s) of the volume for each",
         f"View       {viewpoint(experiment.scene)}",
         f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
-        f"frame(s) in turn; {spread}, phases up to "
+        f"frame{'s' * (settings.frames > 1)} in turn; {spread}, phases up to "
         f"{settings.limit / math.pi:.3g} pi, {_temperatures(settings)} degC above ambient "
         f"(display.rad_per_K={display.rad_per_K:.4g} at {display.rad_per_K_at * 1e9:.4g} nm{thesis}){memory}",
         f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "

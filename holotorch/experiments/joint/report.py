@@ -29,9 +29,7 @@ def joint_outcome(summary: dict[str, Any]) -> list[str]:
     methods: dict[str, Any] = summary["methods"]
     corrected = methods["joint"]
     scores = [
-        f"{corrected[f'{key}_psnr']:.1f} dB {SETS[key]}{_exact(summary, corrected, key)}"
-        for key in ("stack", "half")
-        if f"{key}_psnr" in corrected
+        f"{_score(summary, corrected, key)} {SETS[key]}" for key in ("stack", "half") if f"{key}_psnr" in corrected
     ]
     others = {name: each["stack_psnr"] for name, each in methods.items() if name != "joint"}
     if others:
@@ -74,8 +72,8 @@ def _behind(methods: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _exact(summary: dict[str, Any], scores: dict[str, Any], key: str) -> str:
-    """The PSNR that an exact calculation of the heat and of the light would give, where it is another one.
+def _score(summary: dict[str, Any], scores: dict[str, Any], key: str) -> str:
+    """The PSNR in words: that of an exact calculation of heat and light, and the run's own where it is another one.
 
     The error of the calculation is added to that of the pictures in squares, since neither knows of the other.
     """
@@ -83,7 +81,10 @@ def _exact(summary: dict[str, Any], scores: dict[str, Any], key: str) -> str:
     own = math.hypot(errors.get(HEAT) or 0.0, errors.get(PROPAGATION) or 0.0)  # predicted ones may be much too large
     off = scores.get(f"{key}_error", math.inf)  # runs of before have none
     lost = 20 * math.log10(math.hypot(1, own / off)) if off > 0 else math.inf
-    return f" ({scores[f'{key}_psnr'] - lost:.1f} dB by exact heat and light)" if _CLOSE < lost < math.inf else ""
+    score = scores[f"{key}_psnr"]
+    if not _CLOSE < lost < math.inf:
+        return f"{score:.1f} dB"
+    return f"{score - lost:.1f} dB by exact heat and light ({score:.1f} dB by the run's own calculation)"
 
 
 def joint_section(record: RunRecord) -> list[str]:
@@ -118,12 +119,13 @@ def joint_section(record: RunRecord) -> list[str]:
 _WORDS = (
     "PSNR of the intensity over all images of a set together, mean SSIM, and contrast: the standard deviation of "
     "shown / wanted where the wanted image is bright. One scale for each colour serves all views. Light is the "
-    "fraction of the emitted light that enters the pupil and lands in the window."
+    "fraction of the emitted light that enters the pupil and lands in the window. The solver was given the views "
+    "called trained, and not those called held."
 )
 
 
 def _views(rows: list[dict[str, str]]) -> str:
-    columns = ["view", "", "focus", "pupil (sines: y, x; radius)", "wavelength", "PSNR", "SSIM", "contrast"]
+    columns = ["view", "use", "focus", "pupil (sines: y, x; radius)", "wavelength", "PSNR", "SSIM", "contrast"]
     lines = []
     for row in rows:
         wavelength = float(row["wavelength_m"])
@@ -141,7 +143,8 @@ def _covered(row: dict[str, str]) -> str:
 
 
 def _methods(methods: dict[str, dict[str, Any]]) -> str:
-    columns = ["method", *(f"{words}: dB / SSIM / contrast" for words in SETS.values()), "light", "peak", "seconds"]
+    columns = ["method", *(f"{words}: dB / SSIM / contrast" for words in SETS.values()), "light"]
+    columns += ["largest phase", "hottest pixel (degC above ambient)", "seconds"]
     rows = []
     for name, each in methods.items():
         scores = [
@@ -151,5 +154,6 @@ def _methods(methods: dict[str, dict[str, Any]]) -> str:
             for key in SETS
         ]
         peak = f"{each['peak_phase_pi']:.2f} pi" if "peak_phase_pi" in each else ""
-        rows.append([NAMES[name], *scores, f"{each['light_in_pupil']:.1%}", peak, f"{each['seconds']:.1f}"])
+        hottest = f"{each['peak_temperature_K']:.0f}" if each.get("peak_temperature_K") is not None else ""
+        rows.append([NAMES[name], *scores, f"{each['light_in_pupil']:.1%}", peak, hottest, f"{each['seconds']:.1f}"])
     return table(columns, rows)

@@ -11,6 +11,7 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.seconds import extra_steps_seconds, simulation_seconds
 from holotorch.experiments.planning.correction import (
     HEAT,
+    NO_STEP,
     PROPAGATION,
     STOPPING,
     complete_kernel,
@@ -69,6 +70,8 @@ def _stopping(experiment: PECExperiment, solution: Solution) -> tuple[float | No
         further = solver(stage.objective, solution.x, stage.box)
     except ValueError as error:  # the gradient vanishes if the picture is exact
         return None, f"not measured: {error}"
+    if torch.equal(further.x, solution.x):  # says nothing about the distance from an optimum
+        return None, NO_STEP
     with torch.no_grad():
         before, after = (experiment.picture_in(problem.intensity(x)) for x in (solution.x, further.x))
     how = "met its stopping rule" if bool(solution.converged.all()) else "took all of its steps or stalled"

@@ -51,9 +51,7 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
         scores.append(
             f"SSIM {_fixed(between, 3)} midway between the samples (between.png), which a viewer sees as well"
         )
-    hottest = max(corrected["peak_temperature_rise_K"])
-    melts = ", where silicon has melted: modulator.max_temperature sets a limit" if hottest > _MELTING else ""
-    scores.append(f"hottest pixel {hottest:.0f} degC above ambient{melts}")
+    scores.append(f"hottest pixel {_hottest(corrected)}")
     if not all(corrected.get("converged", [True])) and not any(corrected.get("stalled", ())):
         scores.append(f"the solver took all of its {max(corrected['steps'])} steps")
     kernel = [f"Kernel     {words}" for words in _other_kernels(corrected)]
@@ -66,6 +64,13 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
             "nearer picture come closer"
         )
     return [f"Result     {', '.join(scores)}", *kernel, *advice, *error_line(summary)]
+
+
+def _hottest(corrected: dict[str, Any]) -> str:
+    """The temperature of the hottest pixel in words."""
+    hottest = max(corrected["peak_temperature_rise_K"])
+    melts = ", where silicon has melted: modulator.max_temperature sets a limit" if hottest > _MELTING else ""
+    return f"{hottest:.0f} degC above ambient{melts}"
 
 
 def _unlike(corrected: dict[str, Any], before: dict[str, Any]) -> str:
@@ -127,7 +132,6 @@ def _cells(method: dict[str, Any]) -> dict[str, str]:
 
 def _verdict(run: RunRecord) -> str:
     corrected = run.summary["methods"]["corrected"]
-    hottest = max(corrected["peak_temperature_rise_K"])
     steps, done = max(corrected["steps"]), all(corrected["converged"])
     stop = "met its stop rule" if done else "ran out of steps"
     if any(corrected["stalled"]):
@@ -135,14 +139,17 @@ def _verdict(run: RunRecord) -> str:
     speckle = ", where a Fourier hologram is speckled" if "isolated" not in corrected else ""
     spots = sum(corrected.get("dark_spots", ()))
     if spots:
-        stop += f"; bright pixels that came out dark: {spots}, by speckle noise: solver.reruns or solver.start may help"
+        stop += (
+            f"; {spots} bright pixels (of all colours) came out dark by speckle: solver.reruns or solver.start may help"
+        )
     fewer = any(method["frames"] < corrected["frames"] for method in run.summary["methods"].values())
     single = " The methods that it is compared with show a single frame." if fewer else ""
     return (
-        f"The hottest pixel of the corrected hologram is {hottest:.0f} degC above ambient. The solver took {steps} "
+        f"The hottest pixel of the corrected hologram is {_hottest(corrected)}. The solver took {steps} "
         f"steps and {stop}. Peak memory {run.summary['peak_memory_bytes'] / 1e9:.2f} GB. Heating power is the mean "
         "temperature rise that the heaters alone would cause, before the heat spreads; times the number of pixels and "
-        "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases. They "
+        "the chip's watts per kelvin it is the power in watts. 'Light in window' is the share of the light that falls "
+        "into the picture. Scores are of a float64 simulation of the phases. They "
         "are taken at the samples of the image, one per pixel, where the solver controls the light. 'SSIM half a "
         f"sample off' is the score midway between four samples{speckle}; a viewer sees that light as well.{single}"
     )
@@ -180,7 +187,11 @@ def _zone_table(methods: dict[str, dict[str, Any]]) -> list[str]:
     head = ["method", *(f"{zone['zone']}, {zone['from_deg']} to {zone['to_deg']} deg" for zone in zones)]
     head.append(f"{outermost['zone']}, from {outermost['from_deg']} deg")
     rows = [[METHOD_NAMES.get(name, name), *map(_zone_cell, row)] for name, row in scored.items()]
-    return ["<h2>By eccentricity</h2>" + table(head, rows)]
+    words = (
+        "Eccentricities are those of a picture that fills target.weight.field_deg, as optics that this run does not "
+        "model would show it. Each zone's share of the squared error is that of all pixels alike, without the weight."
+    )
+    return ["<h2>By eccentricity</h2>" + table(head, rows), element("p", words)]
 
 
 def _zone_cell(zone: dict[str, Any]) -> str:

@@ -22,7 +22,7 @@ def study_section(record: RunRecord) -> list[str]:
     summary = record.summary
     parts = [heading(f"{record.title}: {summary['study']}", summary["status"])]
     if source := record.picture("table"):
-        caption = "Each line is a method, each point "
+        caption = "Each line is a method or a number of frames, each point "
         caption += "a median of rounds" if summary["study"] == "time" else "the mean over the photographs"
         parts.append(figure(source, caption, "wide"))
         parts.append(element("p", f"{METHODS}. Sigma: {SIGMA_MEANING}."))

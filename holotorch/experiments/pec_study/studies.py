@@ -151,7 +151,7 @@ def limits(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> I
             for frames in (1, 4):
                 solve = partial(setup.lbfgs, setup.start("hot", frames), steps=steps, limit=multiple * PI)
                 setting = f"P <= {multiple} pi ({multiple * 175} degC at 630 nm)"
-                yield _timed_row(setup, f"{frames} frame(s)", solve, setting=setting)
+                yield _timed_row(setup, "1 frame" if frames == 1 else f"{frames} frames", solve, setting=setting)
         phase = setup.lbfgs(setup.start("hot"), steps=steps).x
         for error in (-0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05):
             formed = replace(setup, sigma_px=sigma * (1 + error)).formed(phase)

@@ -40,7 +40,10 @@ def device_name(device: torch.device) -> str:
     """Name of a GPU, or the number of threads on the processor."""
     import torch
 
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    count = torch.get_num_threads()
+    return f"CPU, {count} thread{'s' * (count > 1)}"
 
 
 def installed_version(name: str) -> str | None:

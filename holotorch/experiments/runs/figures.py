@@ -1,6 +1,7 @@
 """Figures of a run, drawn without any global state of matplotlib."""
 
 import io
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -110,7 +111,7 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
             axes.semilogy(steps[stage:], relative[stage:, i], **style)
     if stage:
         axes.axvline(stage - 0.5, color="0.4", linewidth=1, linestyle=":")
-        label = "the error of the amplitude; from there on that of the intensity, and what a limit adds"
+        label = "the error of the amplitude; from there on that of the intensity, and what a limit adds if there is one"
         axes.set_title(f"The loss up to step {stage - 1} (dotted) is {label}", fontsize=8)
     axes.set(xlabel="step", ylabel="loss / loss at the start")
     axes.grid(alpha=0.3)
@@ -150,10 +151,17 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         for k, method in enumerate(dict.fromkeys(row["method"] for row in selected)):
             curve = [row for row in selected if row["method"] == method]
             x = [positions.index((row["setting"], row["sigma_px"])) for row in curve]
-            axes.plot(x, [row["ssim"] for row in curve], "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
-        step = max(1, len(positions) // 12)
-        labels = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
-        axes.set_xticks(range(0, len(positions), step), labels[::step], fontsize=7, rotation=30 if step > 1 else 0)
+            y = [row["ssim"] for row in curve]
+            # No line leads from one kind of setting to another, or from the settings of one sigma to those of the next.
+            kind_of = [
+                (re.sub(r"[-+]?[\d.]+", "", row["setting"]), row["setting"] and row["sigma_px"]) for row in curve
+            ]
+            gaps = [i for i in range(1, len(x)) if kind_of[i] != kind_of[i - 1]]
+            x, y = np.insert(np.array(x, float), gaps, np.nan), np.insert(y, gaps, np.nan)
+            axes.plot(x, y, "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
+        labels = [f"{setting}, {sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
+        many = len(positions) > 12
+        axes.set_xticks(range(len(positions)), labels, fontsize=6 if many else 7, rotation=90 if many else 0)
         axes.set(ylim=(0, 1.02), ylabel="mean SSIM")
         axes.set_title(f"{title}, {kind}", fontsize=9)
         axes.grid(alpha=0.3)

@@ -234,8 +234,9 @@ def track_section(record: RunRecord) -> list[str]:
     if "failure" in summary:
         parts.append(element("p", summary["failure"], "warn"))
     share = 100 * summary["answered"] / summary["frames"]
-    text = f"{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
-    text += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
+    text = f"{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %)"
+    text += "; every other says why it has none. " if share < 100 else ". "
+    text += "" if "truth" in summary else "Errors against the truth are not known here. "
     parts.append(element("p", text + f"Deviations (sd) are the tracker's own estimate: {_STATED}, which adds to them."))
     parts += [element("p", f"Camera: {words.removeprefix('Camera').strip()}.") for words in camera_line(summary)]
     parts += [_truth(summary["truth"])] if "truth" in summary else []

@@ -78,7 +78,8 @@ def test_a_run_shows_less_speckle_under_wider_sources(tmp_path, monkeypatch):
     )
     page = (folder / "report.html").read_text()
     for words in (
-        "contrast at 636 / 520 / 455 nm",
+        "they are those at 636 / 520 / 455 nm",
+        "predicted contrast",
         "evenly filled round pupil and fully developed speckle",
         "and measures lower",
     ):

@@ -88,7 +88,11 @@ def needed(rows: list[dict[str, Any]], power: float = 0.8) -> list[str]:
             lines.append(f"no slope: a slope is detected by mistake in at most {100 * worst:.1f} % of the studies")
             continue
         enough = [people for people, share in results if share >= power]
-        tried = f"more than the {results[-1][0]} participants that were tried"
-        number = f"{enough[0]} participants" if enough else tried
-        lines.append(f"a slope of {alpha:g} deg/deg is detected in {100 * power:g} % of the studies with {number}")
+        if enough:
+            detected = f"detected in at least {100 * power:g} % of the studies with {enough[0]} participants"
+        else:
+            detected = (
+                f"not detected in {100 * power:g} % of the studies with {results[-1][0]} participants, the most tried"
+            )
+        lines.append(f"a slope of {alpha:g} deg/deg is {detected}")
     return lines

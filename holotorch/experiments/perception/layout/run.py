@@ -214,7 +214,7 @@ def _picture(layouts: Layouts) -> bytes:
                 _box(axes, centre, (target.size_deg + 0.8, target.size_deg + 0.8), "#d00000", "--")
         axes.plot(0, 0, "k+", markersize=11, zorder=400)
         axes.set(xlim=(-wide, wide), ylim=(-high, high), aspect="equal")
-        title = f"Perceived as soon as a pattern of {target.name} of eccentricity (dashed red box around it)"
+        title = f"Scaled icons: perceived as soon as a pattern of {target.name} of eccentricity (dashed red boxes)"
         axes.set_title(title, fontsize=11)
         axes.set_ylabel("elevation (deg)", fontsize=9)
         ticks = range(-int(wide // 10) * 10, int(wide) + 1, 10)

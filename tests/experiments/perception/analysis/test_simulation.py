@@ -152,8 +152,8 @@ def test_how_many_are_needed_in_words():
     rows = [{"alpha": alpha, "participants": people, "power": power} for alpha, people, power in made]
     none, small, large = needed(rows)
     assert "by mistake in at most 5.0 %" in none
-    assert "0.2 deg/deg" in small and "more than the 20" in small
-    assert "0.4 deg/deg" in large and large.endswith("80 % of the studies with 20 participants")
+    assert "0.2 deg/deg is not detected" in small and small.endswith("with 20 participants, the most tried")
+    assert "0.4 deg/deg is detected in at least 80 %" in large and large.endswith("of the studies with 20 participants")
 
 
 def test_lines_of_other_slopes_share_their_middle():
