@@ -3,6 +3,7 @@
 import re
 import shutil
 import sys
+from dataclasses import is_dataclass
 from enum import Enum
 from functools import lru_cache
 from importlib import import_module
@@ -27,6 +28,7 @@ _SHORT = 26  # letters of a word in code type that fits on a phone's line: it is
 def setup(app: Sphinx) -> dict[str, bool]:
     """Connect everything of this module."""
     app.add_directive("public-names", PublicNames)
+    app.connect("autodoc-process-docstring", describe_fields, priority=50)
     app.connect("autodoc-process-docstring", escape_formulas, priority=100)  # before napoleon makes markup of it
     app.connect("autodoc-process-signature", shorten_defaults)
     app.connect("autodoc-process-bases", without_private_bases)
@@ -97,6 +99,23 @@ def constant(name: str, value: object) -> list[str]:
     shown = [f"   :value: {short}"] if short else []
     text = re.sub(r"([*|])", r"\\\1", text[:1].upper() + text[1:])
     return [f".. py:data:: {last}", f"   :module: {package}", *shown, "", f"   {text}", ""]
+
+
+def describe_fields(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Fields of a data class whose docstring does not list them are described by the comments beside or above them."""
+    if not (isinstance(obj, type) and is_dataclass(obj)) or {"Attributes:", "Args:"} & set(lines):
+        return
+    described, above = [], []
+    for line in getsource(obj).splitlines():
+        comment = line.partition("  # ")[2] if not line.startswith("    # ") else line.removeprefix("    # ")
+        if line.startswith("    # "):
+            above.append(comment)
+        elif (found := re.match(r"    (\w+): ", line)) and found[1] in obj.__dataclass_fields__:
+            if text := " ".join(filter(None, [*above, comment])):
+                described.append(f"    {found[1]}: {text[0].upper()}{text[1:]}.")
+            above = []
+    if described:
+        lines += ["", "Attributes:", *described, ""]
 
 
 def escape_formulas(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
