@@ -16,7 +16,7 @@ from holotorch.io.heat_kernels import load_heat_kernel
 from holotorch.modulator import ThermalCrosstalk
 
 HEAT, PROPAGATION, STOPPING = "heat", "propagation", "stopping"  # parts that share the tolerance of a run
-NO_STEP = "not measured: in this precision the solver accepts no further step"
+NO_STEP = "not measured: the solver accepts no further step from there"
 # Residual of a corrected picture against its target. Runs of 64 px at sigma 0.66 to 2 px left 0.01 to 0.6.
 _RESIDUAL = 0.3
 # Error of single precision in the intensity of phases of some rad; 2e-7 to 3e-6 in the same runs.

@@ -24,8 +24,8 @@ def lens_taps(
     u+ = sqrt(2 wavelength |z / m|) (B - f0), and u- the same with B + f0. F = C - iS for z / m > 0 and C + iS
     otherwise, times -i sign(z) for m < 0, with the Fresnel integrals C and S. This is ``fresnel_taps`` over z / m at
     the position x / m, arranged so that all terms are bounded as m -> 0. At m = 0 the weights have a step at
-    abs(x) = wavelength |z| B, with the mean
-    value on the step. Near m = 0 this step is a steep edge with large gradients; at m = 0 gradients omit it.
+    abs(x) = wavelength |z| B, with the mean value on the step. Near m = 0 this step is a steep edge with large
+    gradients; at m = 0 gradients omit it.
 
     Args:
         targets: Positions x in metres from the axis of the lens, float64, shape [n'].
