@@ -1,6 +1,8 @@
 """Run of kind ``pec_study``: writes the table of a study as CSV and text, and as a picture."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from holotorch.experiments.pec_study.bench import Bench
@@ -15,6 +17,8 @@ from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text
+
+_FEW = 4  # pictures that the title of a figure names
 
 
 @dataclass(frozen=True)
@@ -48,12 +52,17 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     files.write(write_table, folder / "table.csv", rows)
     files.write(write_text, folder / "table.txt", text)
     draw = times_picture if settings.study == "time" else curves
-    picture = draw(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
+    picture = draw(rows, f"{settings.study}: mean of {_named(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
     summary |= {"rows": len(rows), "seconds": round(cases.seconds, 1), "peak_memory_bytes": peak_memory()}
     complete = conclude(opened, summary, files, done=True)
     print(text)
     return complete
+
+
+def _named(images: Sequence[str]) -> str:
+    """Names of a few pictures, or how many there are."""
+    return ", ".join(Path(image).stem for image in images) if len(images) <= _FEW else f"{len(images)} photographs"
 
 
 def table_text(rows: list[dict[str, Any]]) -> str:

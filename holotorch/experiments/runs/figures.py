@@ -1,6 +1,7 @@
 """Figures of a run, drawn without any global state of matplotlib."""
 
 import io
+import math
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -147,26 +148,32 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         axes = figure.add_subplot(1, len(kinds), i + 1)
         selected = [row for row in scored if row["kind"] == kind]
         # The study sweeps a setting if it has one, otherwise sigma.
+        if len({row["setting"] for row in selected}) == 1:
+            selected.sort(key=lambda row: row["sigma_px"])
         positions = list(dict.fromkeys((row["setting"], row["sigma_px"]) for row in selected))
         for k, method in enumerate(dict.fromkeys(row["method"] for row in selected)):
             curve = [row for row in selected if row["method"] == method]
             x = [positions.index((row["setting"], row["sigma_px"])) for row in curve]
             y = [row["ssim"] for row in curve]
-            # No line leads from one kind of setting to another, or from the settings of one sigma to those of the next.
-            kind_of = [
-                (re.sub(r"[-+]?[\d.]+", "", row["setting"]), row["setting"] and row["sigma_px"]) for row in curve
-            ]
-            gaps = [i for i in range(1, len(x)) if kind_of[i] != kind_of[i - 1]]
+            gaps = [i for i in range(1, len(x)) if not _swept(curve[i - 1], curve[i])]
             x, y = np.insert(np.array(x, float), gaps, np.nan), np.insert(y, gaps, np.nan)
             axes.plot(x, y, "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
-        labels = [f"{setting}, {sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
-        many = len(positions) > 12
-        axes.set_xticks(range(len(positions)), labels, fontsize=6 if many else 7, rotation=90 if many else 0)
+        many, step = len(positions) > 12, math.ceil(len(positions) / 48)
+        comma = ", " if many else "\n"
+        labels = [f"{setting}{comma}{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
+        ticks = range(0, len(positions), step)
+        axes.set_xticks(ticks, labels[::step], fontsize=6 if many else 7, rotation=90 if many else 0)
         axes.set(ylim=(0, 1.02), ylabel="mean SSIM")
         axes.set_title(f"{title}, {kind}", fontsize=9)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
     return figure_png(figure)
+
+
+def _swept(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether a line leads from one row of a study to another: sigma alone differs, or a number in the setting."""
+    kinds = [re.sub(r"[-+]?[\d.]+", "", row["setting"]) for row in (one, other)]
+    return one["setting"] == other["setting"] or (one["sigma_px"] == other["sigma_px"] and kinds[0] == kinds[1])
 
 
 def pareto_front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
