@@ -248,7 +248,7 @@ def _draw(
 ) -> bytes:
     """Accuracy against time, and what parallax and light in the pupil cost."""
     scenes = amount.scenes
-    figure = Figure(figsize=(14, 4.2), layout="constrained")
+    figure = Figure(figsize=(14, 5.8), layout="constrained")
     left, right, last = figure.subplots(1, 3)
     for frames, colour in zip(amount.frames, ("#2867b2", "#c0392b"), strict=False):
         curve = [row for row in speed if row["frames"] == frames and row["method"] == "joint"]
@@ -272,21 +272,24 @@ def _draw(
     if default:
         mark_choice(left, default, "default steps")
     left.set(xlabel="seconds", ylabel="PSNR of the focal stack (dB)", title=f"{scenes[0]}, {amount.size} px")
+    shown = [case for case in amount.cases if "sigma" not in case and "limit" not in case]
     for scene, marker in zip(scenes, "os", strict=False):
-        for case in (case for case in amount.cases if "sigma" not in case and "limit" not in case):
+        for k, case in enumerate(shown):
             chosen = [r for r in rows if (r["scene"], r["case"], r["method"]) == (scene, case, "joint")]
             x, y = (statistics.mean(row[key] for row in chosen) for key in ("stack_psnr", "half_psnr"))
-            right.plot(x, y, marker, color="#c0392b" if "24" in case else "#2867b2", fillstyle=_fill(case))
-            right.annotate(f"{scene}, {case}", (x, y), fontsize=6, xytext=(4, 4), textcoords="offset points")
+            right.plot(x, y, marker, color=f"C{k}", fillstyle=_fill(case), label=f"{scene}, {case}")
     right.set(xlabel="PSNR of the focal stack (dB)", ylabel="PSNR through half pupils (dB)", title="Parallax costs")
     last.plot([row["light_in_pupil"] for row in light], [row["stack_psnr"] for row in light], "o-", color="#2867b2")
     for row in light:
         place = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 6}
         last.annotate(f"weight {row['weight']:g}", (row["light_in_pupil"], row["stack_psnr"]), **place)
-    last.set(xlabel="fraction of the light in pupil and window", title=f"Light costs; {scenes[0]}, 8 frames")
+    last.set(xlabel="fraction of the light in pupil and window", ylabel="PSNR of the focal stack (dB)")
+    last.set(title=f"Light costs; {scenes[0]}, 8 frames")
+    last.margins(x=0.16)  # for the words beside the points
     for axes in (left, right, last):
         axes.grid(alpha=0.3)
-    left.legend(fontsize=6)
+    for axes in (left, right):
+        axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), frameon=False)
     return figure_png(figure)
 
 
