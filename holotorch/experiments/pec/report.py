@@ -52,7 +52,8 @@ def pec_outcome(summary: dict[str, Any]) -> list[str]:
             f"SSIM {_fixed(between, 3)} midway between the samples (between.png), which a viewer sees as well"
         )
     scores.append(f"hottest pixel {_hottest(corrected)}")
-    if not all(corrected.get("converged", [True])) and not any(corrected.get("stalled", ())):
+    ended = summary.get("status") != "interrupted"
+    if ended and not all(corrected.get("converged", [True])) and not any(corrected.get("stalled", ())):
         scores.append(f"the solver took all of its {max(corrected['steps'])} steps")
     kernel = [f"Kernel     {words}" for words in _other_kernels(corrected)]
     advice = []

@@ -130,7 +130,9 @@ def _decoded(text: str) -> bytes:
     """Decode ``text`` up to "<". It consists of two base64 texts, the length of the data and the data."""
     parts = re.findall(r"[A-Za-z0-9+/]+=*", "".join(text.partition("<")[0].split()))
     # Base64 consists of groups of four characters, of which a truncated file may lack some of the last.
-    return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
+    letters = [part[: len(part) // 4 * 4].rstrip("=") for part in parts]
+    letters = [part[:-1] if len(part) % 4 == 1 else part for part in letters]  # a single letter is less than a byte
+    return b"".join(base64.b64decode(part + "=" * (-len(part) % 4)) for part in letters)
 
 
 def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:

@@ -72,6 +72,16 @@ def test_every_encoding(tmp_path, form, dtype, options):
     assert volume.unit == "relative" and volume.spacing == (2, 0.75, 0.5) and volume.origin == (30, 20, 10)
 
 
+@pytest.mark.parametrize("ending", ["===", "======="])  # behind 117 letters: the last group has one
+def test_damaged_base64_is_refused_as_other_damage(tmp_path, ending):
+    file = write(tmp_path / "a.vti", voxels(), "binary")
+    before, tag, after = file.read_bytes().partition(b"\n</DataArray>")
+    file.write_bytes(before[:-43] + ending.encode() + tag + after)
+    with pytest.raises(ValueError, match="bytes") as caught:
+        load_volume(file)
+    assert type(caught.value) is ValueError
+
+
 def test_length_encoded_together_with_the_data(tmp_path):
     """Some writers do not end the base64 text after the length."""
     volume = load_volume(write(tmp_path / "a.vti", voxels(), "binary", together=True))
