@@ -60,26 +60,26 @@ class PublicNames(SphinxDirective):
     def _section(self, names: list[str]) -> list[str]:
         """Table and docstrings of the objects of these full names, and the constants, as reStructuredText."""
         objects = {name: getattr(import_module(name.rpartition(".")[0]), name.rpartition(".")[2]) for name in names}
-        constants = {name for name, found in objects.items() if not isinstance(found, type) and not isroutine(found)}
+        constants = {name for name, member in objects.items() if not isinstance(member, type) and not isroutine(member)}
         listed = [f"   ~{name}" for name in names if name not in constants]
         lines = [".. autosummary::", "", *listed, ""] if listed else []
-        for name, found in objects.items():
+        for name, member in objects.items():
             if name in constants:
-                lines += constant(name, found)
+                lines += constant(name, member)
             else:
-                kind = "class" if isinstance(found, type) else "function"
-                lines += [f".. auto{kind}:: {name}", *(options(found) if isinstance(found, type) else ()), ""]
+                kind = "class" if isinstance(member, type) else "function"
+                lines += [f".. auto{kind}:: {name}", *(options(member) if isinstance(member, type) else ()), ""]
         return lines
 
 
-def options(found: type) -> list[str]:
+def options(cls: type) -> list[str]:
     """Options of autodoc for a class: members, its own call, and the names of an enumeration."""
-    lines = ["   :show-inheritance:"] if any(map(is_public_base, found.__bases__)) else []
-    if not issubclass(found, tuple):  # the fields of a named tuple are in its docstring
+    lines = ["   :show-inheritance:"] if any(map(is_public_base, cls.__bases__)) else []
+    if not issubclass(cls, tuple):  # the fields of a named tuple are in its docstring
         lines.append("   :members:")
-    if issubclass(found, Enum):
+    if issubclass(cls, Enum):
         lines.append("   :undoc-members:")
-    calls = next((base for base in found.__mro__ if "__call__" in vars(base)), object)
+    calls = next((base for base in cls.__mro__ if "__call__" in vars(base)), object)
     if calls.__module__.startswith("holotorch."):
         lines.append("   :special-members: __call__")
     return lines
@@ -92,9 +92,9 @@ def constant(name: str, value: object) -> list[str]:
     for module in [each for key, each in sys.modules.items() if key.startswith(package)]:
         if vars(module).get(last) is value:
             pattern = rf"((?:^# .*\n)*)^(?:\w+, )*{last}\b[^=\n]*= ([^\n]*)$"
-            if found := re.search(pattern, getsource(module), re.MULTILINE):
-                above = " ".join(line.removeprefix("# ") for line in found[1].splitlines())
-                text = " ".join(filter(None, [above, found[2].partition("  # ")[2]])).strip()
+            if match := re.search(pattern, getsource(module), re.MULTILINE):
+                above = " ".join(line.removeprefix("# ") for line in match[1].splitlines())
+                text = " ".join(filter(None, [above, match[2].partition("  # ")[2]])).strip()
     short = repr(value) if len(repr(value)) < 100 else ""
     shown = [f"   :value: {short}"] if short else []
     text = re.sub(r"([*|])", r"\\\1", text[:1].upper() + text[1:])
@@ -110,9 +110,9 @@ def describe_fields(app: Sphinx, what: str, name: str, obj: object, options: obj
         comment = line.partition("  # ")[2] if not line.startswith("    # ") else line.removeprefix("    # ")
         if line.startswith("    # "):
             above.append(comment)
-        elif (found := re.match(r"    (\w+): ", line)) and found[1] in obj.__dataclass_fields__:
+        elif (match := re.match(r"    (\w+): ", line)) and match[1] in obj.__dataclass_fields__:
             if text := " ".join(filter(None, [*above, comment])):
-                described.append(f"    {found[1]}: {text[0].upper()}{text[1:]}.")
+                described.append(f"    {match[1]}: {text[0].upper()}{text[1:]}.")
             above = []
     if described:
         lines += ["", "Attributes:", *described, ""]

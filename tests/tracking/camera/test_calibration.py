@@ -154,11 +154,11 @@ def test_distances_are_those_of_the_boards_and_grow_with_their_squares():
     poses = oracle.handheld(12, (0.1, 0.0625), 1.0, 0.7, 0)
     middles = [oracle.rotation(r) @ view.points.mean(0).numpy() + t for view, (r, t) in zip(views, poses, strict=True)]
     truth = np.linalg.norm(middles, axis=-1)
-    found = calibrate(views, SHAPE).coverage.distances
+    distances = calibrate(views, SHAPE).coverage.distances
     # The focal length, known to 0.5 %, decides on the distances.
-    assert found == pytest.approx((truth.min(), truth.max()), rel=0.02)
+    assert distances == pytest.approx((truth.min(), truth.max()), rel=0.02)
     larger = calibrate([View(10 * view.points, view.pixels, view.name) for view in views], SHAPE).coverage
-    assert larger.distances == pytest.approx([10 * each for each in found], rel=1e-4)
+    assert larger.distances == pytest.approx([10 * each for each in distances], rel=1e-4)
 
 
 def test_no_views_are_refused():
