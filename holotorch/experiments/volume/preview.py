@@ -1,14 +1,20 @@
 """A quick look at a volume: its values, the transfer function over them, and a rendering without any hologram."""
 
+from dataclasses import replace
+from typing import get_args
+
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.runs.pictures import in_colour
+from holotorch.experiments.volume.config import ViewSettings
 from holotorch.experiments.volume.experiment import VolumeExperiment
 
 _SIDE = 256  # largest number of pixels of the rendering along each side
+_SMALL = 96  # that of the renderings from other sides
 _SAMPLE = 1_000_000  # largest number of voxels in the histogram
 _SHARES = (1, 25, 50, 75, 90, 95, 99, 99.9)  # percentiles that are listed
 
@@ -26,22 +32,37 @@ def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
         visible = (experiment.transfer(values.to(experiment.device))[1] > 0).double().mean().item()
         picture = experiment.quick_rendering(_SIDE)
     bright = picture.amax().item()
-    picture = in_colour(picture, experiment.settings.wavelengths)
     lines = [
         f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of}{f', of one voxel in {every}' * (every > 1)}: "
         + ", ".join(f"{level:.6g} at {share:g} %" for share, level in zip(_SHARES, levels, strict=True)),
         f"Visible    {100 * visible:.2g} % of the voxels have an opacity above 0"
         + ("" if bright > 0.02 else "; the rendering is black: move the transfer function to the values of the volume"),
     ]
-    return _drawn(experiment, values.numpy(), (picture / max(bright, 1e-9)).clamp(0, 1)), "\n".join(lines)
+    return _drawn(experiment, values.numpy(), picture), "\n".join(lines)
+
+
+def _standing(experiment: VolumeExperiment) -> dict[str, torch.Tensor]:
+    """Renderings of an own scan by ``view.up``, without its lighting; none if its file names the sides of a patient."""
+    settings = experiment.settings
+    if not settings.volume.path or experiment.volume.frame not in ("", "xyz"):
+        return {}
+    pictures = {}
+    for up in get_args(ViewSettings.model_fields["up"].annotation):
+        if up != "head":
+            view = settings.view.model_copy(update={"up": up, "samples": experiment.samples})
+            turned = replace(experiment, settings=settings.model_copy(update={"view": view}))
+            pictures[up] = turned.quick_rendering(_SMALL, lit=False)
+    return pictures
 
 
 def _drawn(experiment: VolumeExperiment, values: np.ndarray, picture: torch.Tensor) -> bytes:
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1, 1.5))
-    left.imshow(picture.movedim(0, -1).numpy())
-    left.set_title("rendering, brightest pixel white", fontsize=10)
-    left.set(xticks=[], yticks=[])
+    others = _standing(experiment)
+    figure = Figure(figsize=(11, 6.6 if others else 4.6), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(4.6, 2)) if others else (figure, figure)
+    left, right = above.subplots(1, 2, width_ratios=(1, 1.5))
+    _show(left, experiment, picture, "rendering, brightest pixel white")
+    for axes, (up, other) in zip(below.subplots(1, len(others)) if others else (), others.items(), strict=True):
+        _show(axes, experiment, other, f"view.up={up}" + " (above)" * (up == experiment.settings.view.up))
     counts, edges = np.histogram(values, 256)
     right.stairs(np.maximum(counts, 0.5), edges, fill=True, color="0.75")
     right.set(yscale="log", xlabel="value of the volume", ylabel="voxels (of those counted)")
@@ -56,3 +77,11 @@ def _drawn(experiment: VolumeExperiment, values: np.ndarray, picture: torch.Tens
     over.set(ylabel="opacity of a path of unit_distance, in its colour", ylim=(0, 1.02))
     right.set_title("histogram and transfer function", fontsize=10)
     return figure_png(figure)
+
+
+def _show(axes: Axes, experiment: VolumeExperiment, picture: torch.Tensor, title: str) -> None:
+    """A rendering [C, h, w] as a screen shows it."""
+    coloured = in_colour(picture, experiment.settings.wavelengths) / picture.amax().clamp(min=1e-9)
+    axes.imshow(coloured.clamp(0, 1).movedim(0, -1).numpy())
+    axes.set_title(title, fontsize=10)
+    axes.set(xticks=[], yticks=[])

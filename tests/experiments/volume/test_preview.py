@@ -87,6 +87,41 @@ def test_a_preview_shows_the_volume_and_its_values(scan, tmp_path, capsys):
     assert "has no preview" in capsys.readouterr().err and not (tmp_path / "no.png").exists()
 
 
+def test_a_preview_shows_which_direction_of_a_scan_may_point_up(tmp_path):
+    """A bar along -z, whose end is bright: only one of six small pictures has the bright end above the dark one."""
+    values = np.zeros((20, 20, 20), np.uint8)
+    values[2:18, 9:11, 9:11], values[2:6, 7:13, 7:13] = 100, 200
+    np.save(tmp_path / "bar.npy", values)
+    words = [*TINY, f"volume={{path: {tmp_path / 'bar.npy'}, spacing: 1, unit: relative}}"]
+    words += ["transfer={points: [[50, 1, 1, 1, 0], [100, 1, 1, 1, 0.9]]}", "view={width: 0.1 mm}"]
+    assert main(["check", *words, "--preview", str(tmp_path / "look.png")]) == 0
+    pixels = load_image(tmp_path / "look.png").mean(0)
+    row = pixels[int(0.75 * len(pixels)) :]  # below rendering and histogram
+    leads = []
+    for part in row.tensor_split(6, dim=1):
+        rows = (part < 0.1).any(1).nonzero()
+        black = part[rows.min() : rows.max() + 1]  # a picture without its title
+        half = len(black) // 2
+        columns = slice(black.shape[1] // 10, -black.shape[1] // 10)
+        leads.append((black[:half, columns].sum() / black[half:, columns].sum()).item())
+    order = ("-y", "y", "z", "-z", "x", "-x")
+    assert leads[order.index("-z")] > 2 and leads[order.index("z")] < 0.5
+    assert all(0.8 < leads[order.index(up)] < 1.25 for up in ("-y", "y"))  # a bar along the axis of sight
+
+
+def test_the_preview_of_a_patient_has_no_other_directions(tmp_path):
+    values = (np.arange(8000).reshape(20, 20, 20) % 251).astype(np.uint8)
+    heights = []
+    for name, frame in (("patient", "space: left-posterior-superior\n"), ("thing", "")):
+        directions = "space directions: (1,0,0) (0,1,0) (0,0,1)\n" if frame else "spacings: 1 1 1\n"
+        header = f"NRRD0004\ntype: uint8\ndimension: 3\n{frame}sizes: 20 20 20\n{directions}encoding: raw\n\n"
+        (tmp_path / f"{name}.nrrd").write_bytes(header.encode() + values.tobytes())
+        words = [*TINY, f"volume={{path: {tmp_path / name}.nrrd}}", "transfer={preset: bone}", "view={width: 0.1 mm}"]
+        assert main(["check", *words, "--preview", str(tmp_path / f"{name}.png")]) == 0
+        heights.append(load_image(tmp_path / f"{name}.png").shape[-2])
+    assert heights[0] < 0.8 * heights[1]
+
+
 def test_an_eye_sees_an_own_volume_by_the_same_keys(scan, tmp_path, capsys):
     change = EYE[0].removeprefix("scene=")
     words = ["configs/eye/teapot.yaml", f"scene={change}", *EYE[1:], "seeds=1", "light={sources: [laser]}"]
