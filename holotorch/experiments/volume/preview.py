@@ -58,10 +58,12 @@ def _standing(experiment: VolumeExperiment) -> dict[str, torch.Tensor]:
 def _drawn(experiment: VolumeExperiment, values: np.ndarray, picture: torch.Tensor) -> bytes:
     others = _standing(experiment)
     figure = Figure(figsize=(11, 6.6 if others else 4.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(4.6, 2)) if others else (figure, figure)
-    left, right = above.subplots(1, 2, width_ratios=(1, 1.5))
+    rows = figure.add_gridspec(2, 1, height_ratios=(4.6, 2)) if others else figure.add_gridspec(1, 1)
+    places = rows[0].subgridspec(1, 2, width_ratios=(1, 1.5))
+    left, right = figure.add_subplot(places[0]), figure.add_subplot(places[1])
     _show(left, experiment, picture, "rendering, brightest pixel white")
-    for axes, (up, other) in zip(below.subplots(1, len(others)) if others else (), others.items(), strict=True):
+    for k, (up, other) in enumerate(others.items()):
+        axes = figure.add_subplot(rows[1].subgridspec(1, len(others))[k])
         _show(axes, experiment, other, f"view.up={up}" + " (above)" * (up == experiment.settings.view.up))
     counts, edges = np.histogram(values, 256)
     right.stairs(np.maximum(counts, 0.5), edges, fill=True, color="0.75")
