@@ -45,11 +45,11 @@ class TrackKind(ExperimentKind[TrackSettings, "TrackingExperiment"]):
         return text + (f", the recorded ones by: holotorch track {recording}" if recording.is_dir() else "")
 
     def outcome(self, summary: dict[str, Any]) -> list[str]:
-        from holotorch.experiments.tracking.report import camera_line, refusals, verdict
+        from holotorch.experiments.tracking.report import camera_line, doubts, refusals, verdict
         from holotorch.experiments.tracking.synthetic import compared
 
         truth = [compared(summary["truth"])] if "truth" in summary else []
-        return [verdict(summary), *refusals(summary), *camera_line(summary), *truth]
+        return [verdict(summary), *refusals(summary), *doubts(summary), *camera_line(summary), *truth]
 
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.tracking.report import track_section

@@ -83,6 +83,7 @@ class Log:
     beyond: int = 0  # frames in which the tube goes on beyond the tip of the pose
     # Refused frames and the first of them, by status and reason without its numbers.
     refused: dict[tuple[str, str], tuple[int, str]] = field(default_factory=dict)
+    unverified: dict[tuple[str, str], tuple[int, str]] = field(default_factory=dict)  # the same of UNVERIFIED poses
 
     def wants(self, item: Tracked) -> bool:
         """Whether the page will show the overlay of this frame."""
@@ -98,10 +99,11 @@ class Log:
             self.pictures[item.status.name] = _caption(item)
         if pose.answered and self.first is None:
             self.first = pose
-        if not pose.answered:
+        if item.status is not Status.OK:
+            kinds = self.unverified if pose.answered else self.refused
             kind = item.status.name, re.sub(r"\d+(\.\d+)?", "#", pose.reason)
-            count, first = self.refused.get(kind, (0, _caption(item)))
-            self.refused[kind] = count + 1, first
+            count, first = kinds.get(kind, (0, _caption(item)))
+            kinds[kind] = count + 1, first
         self.statuses.append(item.status)
         self.times.append(item.frame.seconds)
         self.tips.append(pose.tip.tolist() if pose.answered else [math.nan] * 3)
@@ -121,8 +123,9 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     answered = sum(status.answered for status in log.statuses)
     summary: dict[str, Any] = {"experiment": "track", "status": "", "source": frames.name, "method": method}
     summary |= {"frames": len(log.statuses), "answered": answered, "statuses": counts(log.statuses)}
-    common = sorted(log.refused.items(), key=lambda each: -each[1][0])[:_SHOWN]
-    summary["refused"] = [{"status": kind[0], "frames": n, "first": first} for kind, (n, first) in common]
+    for name, kinds in (("refused", log.refused), ("unverified", log.unverified)):
+        common = sorted(kinds.items(), key=lambda each: -each[1][0])[:_SHOWN]
+        summary[name] = [{"status": kind[0], "frames": n, "first": first} for kind, (n, first) in common]
     summary |= {"seconds": log.times[-1] - log.times[0], "stated_rate_hz": frames.rate}
     stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
     if answered:
@@ -180,6 +183,7 @@ _ADVICE = {
 }
 
 
+_THIS_CAMERA = "are `edges` counted from the tip, and is the camera's file that of this camera, at this focus?"
 _SINGLE = "the files fit the other frames: is something across or beside a band there, or a highlight on it?"
 
 
@@ -214,10 +218,22 @@ def refusals(summary: dict[str, Any]) -> list[str]:
     few = summary["answered"] > _MANY * (summary["frames"] - summary["answered"])
     advice = _ADVICE | ({Status.INCONSISTENT: _SINGLE} if few else {})
     lines = [f"Refused    {each['frames']} like {each['first']}; {advice[Status[each['status']]]}" for each in common]
+    if rest := summary["frames"] - summary["answered"] - sum(each["frames"] for each in common):
+        lines[-1] += f"; {rest} more for other reasons (poses.csv)"
     wrong = summary.get("statuses", {}).get(Status.INCONSISTENT.name, 0)
     if summary["answered"] and wrong > 3 * summary["answered"]:
         lines.append(f"Warning    the {summary['answered']} poses beside so many contradictions may be wrong, too")
     return lines
+
+
+def doubts(summary: dict[str, Any]) -> list[str]:
+    """Why poses are UNVERIFIED, if one frame in fifty or more is so for one reason."""
+    many = [each for each in summary.get("unverified", ()) if 50 * each["frames"] >= summary["frames"]]
+    return [
+        f"Unverified {each['frames']} like {each['first']}; "
+        + (_THIS_CAMERA if each["first"].endswith(BEYOND_TIP) else "is a band covered or out of the picture there?")
+        for each in many
+    ]
 
 
 def save_figure(folder: Path, log: Log) -> None:

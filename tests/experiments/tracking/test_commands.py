@@ -6,22 +6,24 @@ import shutil
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import paths
 import pytest
+import torch
 
 from holotorch.cli import main
 from holotorch.experiments import execute
 from holotorch.experiments.streaming import check as stream_check
 from holotorch.experiments.streaming import stream
 from holotorch.experiments.tracking import run, synthetic
-from holotorch.experiments.tracking.report import Log, Tracked, refusals
+from holotorch.experiments.tracking.report import Log, Tracked, doubts, refusals
 from holotorch.experiments.tracking.synthetic import write_synthetic
 from holotorch.io.video import Frame
-from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.pose.status import BEYOND_TIP, THREE_EDGES, Pose, Status
 from holotorch.tracking.streaming.packet import PosePacket, decode
 
 CONFIGS = paths.CONFIGS / "tracking"
@@ -278,6 +280,7 @@ def test_a_run_with_few_poses_says_what_to_look_at(tmp_path):
     assert first.startswith(f"Refused    4 like frame 1, INCONSISTENT: {wide.format(0.45)}; no pose explains")
     assert "`radius` (half the thickness)" in first
     assert second.startswith("Refused    2 like frame 5, UNCERTAIN: tip uncertain to 3.0 mm; are the lengths of the ")
+    assert second.endswith("; 1 more for other reasons (poses.csv)") and "more for" not in first
     assert refusals({"refused": refused, "answered": 22, "frames": 29})
     (single, _) = refusals({"refused": refused, "answered": 48, "frames": 55})
     assert "the files fit the other frames: is something across or beside a band" in single
@@ -290,6 +293,25 @@ def test_a_run_with_few_poses_says_what_to_look_at(tmp_path):
                 {"refused": [{"status": status.name, "frames": 2, "first": "frame 0"}], "answered": 0, "frames": 2}
             )
             assert line.startswith("Refused    2 like frame 0; ")
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"), [(BEYOND_TIP, "is the camera's file that of this camera"), (THREE_EDGES, "is a band covered")]
+)
+def test_a_run_says_why_poses_are_unverified(tmp_path, reason, words):
+    log = Log(tmp_path)
+    one = torch.tensor(1.0)
+    pose = Pose(torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), torch.eye(6), one, one, Status.OK)
+    for i in range(50):
+        last = i == 49
+        item = replace(pose, status=Status.UNVERIFIED, reason=reason) if last else pose
+        log.take(Tracked(i, Frame(float(i), None), item, 0.0, {}), None)
+    (kind,) = log.unverified.items()
+    summary = {"unverified": [{"status": kind[0][0], "frames": kind[1][0], "first": kind[1][1]}], "frames": 50}
+    (line,) = doubts(summary)
+    assert line.startswith(f"Unverified 1 like frame 49, UNVERIFIED: {reason}; ") and words in line
+    assert not doubts(summary | {"frames": 51}) and not doubts({"frames": 50})  # nor in summaries of before
+    assert not log.refused
 
 
 def free_port() -> int:
