@@ -110,12 +110,18 @@ def test_no_note_proposes_more_planes_than_a_run_takes():
         assert proposed == [MOST_PLANES] * (planes < MOST_PLANES) and "a smaller pupil" in text
 
 
-def test_a_volume_wider_than_the_array_is_noted_with_the_width_that_fits():
-    wide = check(settings("view.width=4 mm"))
+@pytest.mark.parametrize("rows", range(52, 64, 3))
+def test_a_volume_wider_than_the_array_is_noted_with_the_width_that_fits(rows):
+    """The width that fits is stated in two digits, for arrays in which the nearest ones are above and below it."""
+    array = f"display.shape=[{rows}, 64]"
+    wide = check(settings("view.width=4 mm", array))
     (note,) = [line for line in wide.text.splitlines() if "is cut off" in line]
     assert "beside the array" in note and "4 mm wide" in wide.text
     fits = re.search(r"view\.width=([\d.]+ mm)", note)
-    assert fits and "is cut off" not in check(settings(f"view.width={fits[1]}")).text
+    assert fits and "is cut off" not in check(settings(f"view.width={fits[1]}", array)).text
+    _, height, width = build(settings(array)).scene.volume.extent  # its rows are horizontal
+    longest = max(height, width) * min(rows / height, 64 / width) * 9e-6  # of a volume that fits exactly
+    assert 0.9 * longest < 1e-3 * float(fits[1].split()[0]) <= longest * (1 + 1e-9)
 
 
 def test_a_tolerance_reaches_kernel_planes_padding_and_stopping_rule():
