@@ -41,7 +41,7 @@ MEANINGS = {
     "StudySettings.max_steps": "largest number of steps of each solver",
     # Volumes.
     "VolumeSettings.tolerance": "largest relative error, divided between the hologram and its refocusing",
-    "VolumeSource.path": "a volume: NRRD, MetaImage, raw, TIFF, VTK, NIfTI, DICOM, HDF5, Zarr, NumPy, or a folder of pictures",
+    "VolumeSource.path": "NRRD, MetaImage, raw, TIFF, VTK, NIfTI, DICOM, HDF5, Zarr, NumPy, or a folder of pictures",
     "VolumeSource.scene": "a volume of the public catalogue, fetched once",
     "VolumeSource.phantom": "a synthetic volume",
     "VolumeSource.samples": "samples of a phantom along each axis",
