@@ -68,7 +68,7 @@ def _behind(methods: dict[str, Any]) -> list[str]:
         scores = {name: each[f"{key}_psnr"] for name, each in methods.items() if f"{key}_psnr" in each}
         best = max(scores, key=scores.__getitem__, default="joint")
         if "joint" in scores and scores[best] > scores["joint"]:
-            lines.append(f"behind {NAMES[best]} {where}: {scores['joint']:.1f} dB against {scores[best]:.1f}")
+            lines.append(f"{where}, {scores['joint']:.1f} dB against {scores[best]:.1f} of: {NAMES[best]}")
     return lines
 
 

@@ -113,7 +113,7 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     if "distance_mm" in physics:
         periodic = f"; the periodic model is alias-free up to {_listed(physics['alias_free_mm'])} mm"
         unresolved = max(map(abs, physics["distance_mm"])) > physics["resolved_mm"]
-        blurred = ": fine detail is blurred there" if unresolved else ""
+        blurred = ": fine detail is blurred there, between the samples" if unresolved else ""
         lines.append(
             f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot of each colour"
             f"{', at the farthest,' if len(physics['distance_mm']) > 1 else ''} {_listed(physics['spot_um'])} um, "

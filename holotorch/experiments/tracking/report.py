@@ -131,6 +131,8 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     if answered:
         summary["tip_sd_mm"] = {"median": 1e3 * quantile(stated, 0.5), "largest": 1e3 * quantile(stated, 1.0)}
         summary["tip_sd_holds"] = _STATED
+        away = torch.tensor(log.tips, dtype=torch.float64).norm(dim=-1)
+        summary["tip_distance_m"] = [float(bound) for bound in away[away.isfinite()].aminmax()]
     if log.seconds:
         taken = 1e3 * torch.tensor(log.seconds, dtype=torch.float64)
         shares = (("median", 0.5), ("p95", 0.95), ("largest", 1.0))
@@ -193,6 +195,8 @@ def verdict(summary: dict[str, Any]) -> str:
     text = f"Frames     {summary['answered']} of {summary['frames']} with a pose ({statuses})"
     if "milliseconds" in summary:
         text += f"; {summary['milliseconds']['median']:.1f} ms each, slowest {summary['milliseconds']['largest']:.1f}"
+    if nearest := summary.get("tip_distance_m"):  # none in runs of before
+        text += f"; tips {nearest[0]:.2f} to {nearest[1]:.2f} m from the camera"
     if "stability" in summary:
         text += f"; S_RMS {summary['stability']['s_rms_mm']:.3f} mm unfiltered"
     return text

@@ -364,6 +364,6 @@ def test_a_result_names_the_views_in_which_another_method_is_ahead():
         "slabs": {"stack_psnr": 23.3, "half_psnr": 31.0, "part_psnr": 21.1},
     }
     text = "\n".join(joint_outcome({"methods": methods}))
-    assert f"behind {NAMES['slabs']} through half pupils: 30.3 dB against 31.0" in text
-    assert f"behind {NAMES['random']} through circles: 26.6 dB against 28.2" in text
-    assert "behind" not in "\n".join(joint_outcome({"methods": {"joint": methods["joint"]}}))
+    assert f"through half pupils, 30.3 dB against 31.0 of: {NAMES['slabs']}" in text
+    assert f"through circles, 26.6 dB against 28.2 of: {NAMES['random']}" in text
+    assert "against" not in "\n".join(joint_outcome({"methods": {"joint": methods["joint"]}}))

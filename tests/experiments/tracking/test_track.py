@@ -13,7 +13,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking import run as tracking_run
 from holotorch.experiments.tracking import source as track_source
 from holotorch.experiments.tracking.devices import save_camera, save_catheter
-from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, drawn_track
+from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, drawn_track, verdict
 from holotorch.experiments.tracking.run import follow, live
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
@@ -52,6 +52,10 @@ def test_every_frame_gets_a_pose_or_a_reason(tmp_path, tracker):
         {"stage": "colour", "milliseconds": pytest.approx(2), "percent": pytest.approx(25)},
         {"stage": "edges", "milliseconds": pytest.approx(6), "percent": pytest.approx(75)},
     ]
+    tips = [[float(row[f"tip_{axis}_m"]) for axis in "xyz"] for row in rows if row["tip_x_m"]]
+    away = [math.dist(tip, (0, 0, 0)) for tip in tips]
+    assert told["tip_distance_m"] == pytest.approx([min(away), max(away)], abs=1e-15)
+    assert f"; tips {min(away):.2f} to {max(away):.2f} m from the camera" in verdict(told)
     # Two pairs of neighbours, 1 mm each; the pair across the refusals is none.
     assert told["stability"]["s_rms_mm"] == pytest.approx(1.0) and told["stability"]["differences"] == 2
     page = (folder / "report.html").read_text()
