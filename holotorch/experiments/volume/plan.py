@@ -341,9 +341,9 @@ def cut_off(experiment: VolumeExperiment, what: str) -> list[str]:
     fits = min(height / sides[1], width / sides[2])
     if fits >= 1 or (lost := _lost_light(experiment, sides)) <= 0.005:
         return []
-    whole = experiment.width * fits * 1e3
-    step = 10.0 ** (math.floor(math.log10(whole)) - 1)
-    whole = f"{step * math.floor(whole / step):.2g} mm"  # rounded down, so that it fits
+    fitting = experiment.width * fits * 1e3
+    step = 10.0 ** (math.floor(math.log10(fitting)) - 1)
+    whole = f"{step * math.floor(fitting / step):.2g} mm"  # rounded down, so that it fits
     return [
         f"{100 * lost:.1f} % of the volume's light lies beside the {what}, {width * 1e3:.3g} mm wide and "
         f"{height * 1e3:.3g} mm high, and is cut off; about 'view.width={whole}' shows all of it"

@@ -59,8 +59,8 @@ def _drawn(experiment: VolumeExperiment, values: np.ndarray, picture: torch.Tens
     others = _standing(experiment)
     figure = Figure(figsize=(11, 6.6 if others else 4.6), layout="constrained")
     rows = figure.add_gridspec(2, 1, height_ratios=(4.6, 2)) if others else figure.add_gridspec(1, 1)
-    places = rows[0].subgridspec(1, 2, width_ratios=(1, 1.5))
-    left, right = figure.add_subplot(places[0]), figure.add_subplot(places[1])
+    upper = rows[0].subgridspec(1, 2, width_ratios=(1, 1.5))
+    left, right = figure.add_subplot(upper[0]), figure.add_subplot(upper[1])
     _show(left, experiment, picture, "rendering, brightest pixel white")
     for k, (up, other) in enumerate(others.items()):
         axes = figure.add_subplot(rows[1].subgridspec(1, len(others))[k])
