@@ -55,6 +55,7 @@ class March:
         volume, place, transfer, rays = self.volume, self.place, self.transfer, self.rays
         self.dtype, self.device = transfer.colours.dtype, volume.values.device
         self.channels = transfer.colours.shape[1]
+        self.ends = place.depth_range()
         if volume.values.is_floating_point():
             self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
         # If voxels are optimised none is skipped, since transparent voxels have a gradient as well. Without values,
@@ -75,8 +76,7 @@ class March:
 
     def parts(self, low: float, high: float) -> list[tuple[float, float]]:
         """Smallest and largest depths of the parts of a slab, front to back; none for a slab beside the volume."""
-        near, far = self.place.depth_range()
-        low, high = max(low, near), min(high, far)
+        low, high = max(low, self.ends[0]), min(high, self.ends[1])
         if low >= high:
             return []
         ends = [low + (high - low) * i / self.samples for i in range(self.samples)] + [high]

@@ -270,7 +270,7 @@ def observer(settings: ObserverSettings, scene_settings: VolumeSettings) -> Obse
         raise ConfigError([f"wavelengths: {error}"]) from error
     focus = settings.focus
     if focus is None:
-        depth = scene.sampler().depth_map(scene.volume)
+        depth = scene.depth_map()
         visible = depth[depth > 0].sort().values
         if not len(visible):
             raise ConfigError(["scene: nothing of the volume is visible; change its transfer function"])

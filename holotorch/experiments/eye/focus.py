@@ -93,8 +93,7 @@ class Surface:
 def visible_surface(eye: Observer) -> Surface:
     """The visible surface of a scene. ValueError for a scene without a surface, or with a surface at a single depth."""
     rendering, opacity = eye.scene.rendering()
-    with torch.no_grad():
-        depth = eye.scene.sampler().depth_map(eye.scene.volume).cpu()
+    depth = eye.scene.depth_map()
     opaque = opacity > _OPAQUE
     shown = depth[opaque].sort().values
     if len(shown) < _LEAST:

@@ -34,8 +34,7 @@ class VolumeEvaluation:
     def __init__(self, experiment: VolumeExperiment):
         self.experiment = experiment
         self.rendering, self.opacity = experiment.rendering()
-        with torch.no_grad():
-            self.depth = experiment.sampler().depth_map(experiment.volume).cpu()
+        self.depth = experiment.depth_map()
         self.visible = self.opacity > VISIBLE
         self.depths = experiment.refocus or self._quantiles()
         self.sums = torch.zeros(len(self.depths), *self.rendering.shape)

@@ -39,7 +39,7 @@ HOLOGRAM, REFOCUSING = "hologram", "refocusing"  # parts that share the toleranc
 _SINGLE = 5e-6  # tolerance below which fields are complex128: 10 times the rounding of a sum in complex64
 _SMOOTH = 8  # correlation length of smooth phases, in rays
 _CLOSE = 0.003  # predicted error above which slabs are sampled more than once; at 1 %, surfaces have rings
-_QUICK_PLANES = 1000  # planes of a quick rendering at most; as many slabs as voxels along the depth are thin enough
+_QUICK_PLANES = 1000  # planes of a preview at most; as many slabs as voxels along the depth are thin enough
 
 # Arguments in the messages of ``load_volume``, and the settings that stand for them; those named in full come first.
 _SETTINGS = (
@@ -214,8 +214,8 @@ class VolumeExperiment:
     def _slab_error(self, samples: int) -> float:
         return self.sampler(samples=samples).slab_error(self.volume)
 
-    def sampler(self, seed: int = 0, samples: int | None = None) -> DVRSampler:
-        """The renderer with the random phases of a realisation; ``samples`` in place of those of the run."""
+    def sampler(self, seed: int = 0, samples: int | None = None, depths: Sequence[float] | None = None) -> DVRSampler:
+        """The renderer with the random phases of a realisation, by default with the samples and depths of the run."""
         generator = torch.Generator().manual_seed(self.settings.seed + seed)
         phases: dict[str, Callable[[Grid], Tensor | PointPhases] | None] = {
             "ray": lambda grid: random_phase(grid, generator=generator),
@@ -226,7 +226,7 @@ class VolumeExperiment:
         sampler = DVRSampler(
             self.transfer,
             self.rays,
-            self.depths,
+            depths or self.depths,
             width=self.width,
             distance=self.distance,
             rotation=self.rotation,
@@ -242,6 +242,14 @@ class VolumeExperiment:
         with torch.no_grad():
             picture, opacity = self.sampler().render(self.volume)
         return picture[: len(self.settings.wavelengths)].cpu(), opacity.cpu()
+
+    def depth_map(self) -> Tensor:
+        """Mean depth in metres of what each ray shows, [h, w]; 0 where all is transparent.
+
+        Of more than a thousand planes, neighbours are joined as by :meth:`quick_rendering`.
+        """
+        with torch.no_grad():
+            return self.sampler(depths=_joined(self.depths, _QUICK_PLANES)).depth_map(self.volume).cpu()
 
     def quick_rendering(self, side: int, *, lit: bool = True) -> Tensor:
         """The same picture on at most ``side`` rays along each side, without lighting and scattering unless ``lit``.

@@ -33,7 +33,9 @@ from holotorch.optics.viewing.rays import samples_for_all_light
 Sampling = CollapseSampling | ElementSampling
 Lines = tuple[Tensor | None, Tensor | None]  # complex128 [L, n] along y and x; None for an axis of one sample
 
-_LINES = 16  # per axis
+_LINES = 16  # per axis, fewer if their transforms together have more samples than _SAMPLES
+_SAMPLES = 2**20
+_LONGEST = 2**21  # samples of the transform of one line; a second of computing for each wavelength, focus and axis
 _NOISE = 1024  # samples of noise per axis, for which fewer lines suffice if they are long; errors vary by about 10 %
 _FINER = 1.5  # samples of the reference for each that element-by-element propagation needs
 _WIDER = 2.0  # width of the reference's window relative to that of element-by-element propagation
@@ -54,8 +56,9 @@ def scene_lines(grid: Grid, wavelength: float, plane: float, half_width: float) 
         points = 2 * math.floor(half_width / pitch) + 1
         enough = samples_for_all_light(points, size, pitch, wavelength, plane)
         padded = Grid((1, good_length(math.ceil(max(enough, points, size)))), pitch)
+        _check_length(padded.shape[1])
         kernel = angular_spectrum_kernel(padded, wavelength, -plane, band_limit=False)
-        spectrum = multiplied(fft2(_noise(points)[:, None], padded.shape), kernel)
+        spectrum = multiplied(fft2(_affordable(_noise(points), padded.shape[1])[:, None], padded.shape), kernel)
         return ifft2(spectrum, (1, size), (0, (points // 2 - size // 2) % padded.shape[1]))[:, 0]
 
     return _both_axes(grid, light)
@@ -89,7 +92,8 @@ def line_errors(
     """Relative L2 error of the intensity of all channels together, for each method with its sizes in ``samplings``.
 
     ``lines`` are those of the hologram for each wavelength, and ``dtype`` is the type of the fields of the methods. The
-    other arguments are those of ``propagate_collapsed``. See the text of this module.
+    other arguments are those of ``propagate_collapsed``. See the text of this module. ValueError if the light of a line
+    spreads over too many samples.
     """
     display, eye = _without_gradients(display), _without_gradients(eye)
     least = least_oversampling(grid, wavelengths, display, eye, plane=plane)
@@ -102,12 +106,15 @@ def line_errors(
             sizes = tuple(_of_axis(sampling, axis) for sampling in samplings)
             key = id(light), grid.pitch[axis], sizes  # equal axes have equal errors
             if key not in known:
-                line = Grid((1, light.shape[1]), grid.pitch[axis])
+                line, finer = Grid((1, light.shape[1]), grid.pitch[axis]), _finer(least, axis)
+                _check_length(finer.fine[1])
+                light = _affordable(light, finer.fine[1])
                 steps = [_pupil_step(sampling, line, wavelength, display, plane) for sampling in sizes]
                 setup = line, wavelength, display, _between_samples(eye, max(steps)), plane, paraxial
-                exact = _image(light, _finer(least, axis), *setup)
+                exact = _image(light, finer, *setup)
                 images = [_image(light.to(dtype), sampling, *setup) for sampling in sizes]
-                known[key] = exact.square().sum(), torch.stack([(image - exact).square().sum() for image in images])
+                squares_of = [(image - exact).square().sum() for image in images]
+                known[key] = exact.square().sum() / len(light), torch.stack(squares_of) / len(light)
             parts.append(known[key])
         energy = sum(exact for exact, _ in parts) / len(parts)
         squares += energy * sum(error / exact.clamp_min(1e-300) for exact, error in parts)
@@ -165,6 +172,20 @@ def _finer(sampling: ElementSampling, axis: int) -> ElementSampling:
         (1, good_length(math.ceil(padded))),
         (1, good_length(math.ceil(fine))),
     )
+
+
+def _check_length(samples: int) -> None:
+    """ValueError if the transform of a line takes too long."""
+    if samples > _LONGEST:
+        raise ValueError(
+            f"the light of a row of the hologram spreads over {samples:.2g} samples, expected {_LONGEST:.2g} at most; "
+            "bring eyepiece and eye nearer to the hologram, or use a coarser pitch"
+        )
+
+
+def _affordable(lines: Tensor, samples: int) -> Tensor:
+    """As many of ``lines`` [L, n], at equal steps, as there is time for with transforms of ``samples``; at least 1."""
+    return lines[:: math.ceil(len(lines) / max(1, min(len(lines), _SAMPLES // samples)))]
 
 
 def _without_gradients(lengths: Any) -> Any:

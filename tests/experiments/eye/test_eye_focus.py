@@ -92,6 +92,6 @@ def test_without_a_surface_there_is_nothing_to_sweep(monkeypatch):
             return torch.full((16, 16), 6e-3)
 
     for sampler, why in ((Clear, "a sweep needs a surface: only 0 rays"), (Wall, "surface lies at 6 mm")):
-        monkeypatch.setattr(type(eye.scene), "sampler", lambda _, sampler=sampler: sampler())
+        monkeypatch.setattr(type(eye.scene), "sampler", lambda _, sampler=sampler, **__: sampler())
         with pytest.raises(ValueError, match=why):
             focus_sweep(eye, SweepSettings())

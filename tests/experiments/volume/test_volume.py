@@ -24,6 +24,7 @@ from holotorch.experiments.volume.experiment import Part, build
 from holotorch.experiments.volume.plan import dark_picture, plan_text, plan_values
 from holotorch.hologram import ConvolutionHologram
 from holotorch.scene.march import March
+from holotorch.scene.sampler import DVRSampler
 
 CONFIGS = paths.CONFIGS / "volume"
 TINY = [
@@ -309,6 +310,26 @@ def test_joined_planes_are_as_dark_as_all_of_them(name, monkeypatch):
     assert (pictures[0] - pictures[1]).norm() < 0.05 * pictures[0].norm()  # slabs of up to half a voxel
     monkeypatch.setattr(volume_experiment, "_QUICK_PLANES", 3)
     assert (build(config).quick_rendering(64, lit=False) - pictures[0]).norm() > 0.1 * pictures[0].norm()
+
+
+def test_depths_of_very_many_planes_follow_from_those_of_fewer(monkeypatch):
+    """A plan with 65,536 planes took half a minute, most of it for this map (a find of fuzzing)."""
+    scene = build(settings("hologram.depths=600", "transfer.unit_distance=0.02"))
+    every = scene.sampler().depth_map(scene.volume).cpu()
+    assert scene.depth_map().equal(every)
+    monkeypatch.setattr(volume_experiment, "_QUICK_PLANES", 100)
+    planes, exact = [], DVRSampler.depth_map
+
+    def counted(sampler, volume):
+        planes.append(len(sampler.depths))
+        return exact(sampler, volume)
+
+    monkeypatch.setattr(DVRSampler, "depth_map", counted)
+    fewer = scene.depth_map()
+    assert planes == [100]
+    slab = (max(scene.depths) - min(scene.depths)) / 100
+    both = (every > 0) & (fewer > 0)
+    assert both.sum() > 0.99 * (every > 0).sum() and (fewer - every)[both].abs().max() < slab
 
 
 def test_few_planes_show_the_whole_volume_and_not_slices_of_it():

@@ -16,6 +16,7 @@ from holotorch.core.complex import intensity
 from holotorch.core.fourier import good_length
 from holotorch.io.images import load_image
 from holotorch.optics import Display, Eye, Retina, plan_retina, propagate, propagate_collapsed, propagate_elements
+from holotorch.optics.viewing import line_errors as retina_lines
 from holotorch.optics.viewing.elementwise import least_oversampling
 from holotorch.optics.viewing.imaging import collapse_sampling, retinal_scale
 from holotorch.optics.viewing.line_errors import field_lines, line_errors, noise_lines, scene_lines
@@ -169,6 +170,39 @@ def test_errors_of_colours_and_axes_add_up():
     assert line_errors([dark, dark], *setup) == [0.0]
     [rows], [columns] = line_errors([(None, x)] * 2, *setup), line_errors([(y, None)] * 2, *setup)
     assert both == pytest.approx(math.hypot(rows, columns), rel=0.1)  # the colours weigh a little differently
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_fewer_lines_predict_the_errors_of_all(view, monkeypatch):
+    """An eye two metres away took four seconds for each focus (a find of fuzzing)."""
+    grid, wavelength, display, eye = VIEWS[view]
+    setup, plane = (grid, [wavelength], display, eye), float(display.focus_plane(eye.accommodation))
+    samplings = [collapse_sampling(*setup, plane), least_oversampling(*setup)]
+    rows, propagated = [], retina_lines.propagate_elements
+
+    def counted(field, *arguments, **options):
+        rows.append(len(field))
+        return propagated(field, *arguments, **options)
+
+    monkeypatch.setattr(retina_lines, "propagate_elements", counted)
+    errors = []
+    for most, lines in ((2**20, 16), (1, 1)):
+        monkeypatch.setattr(retina_lines, "_SAMPLES", most)
+        rows.clear()
+        errors.append(line_errors([noise_lines(grid)], *setup, plane, samplings))
+        assert max(rows) == lines
+    for every, few in zip(*errors, strict=True):
+        assert 1 / 2 < few / every < 2  # one line is a sample of 24 to 64 of noise instead of 384 to 1024
+
+
+@pytest.mark.parametrize("reach", [None, 1e-4])
+def test_light_that_spreads_over_too_many_samples_is_refused(reach):
+    """Ten metres away, pixels of 1 um light a strip 5 m wide."""
+    grid, eye = Grid(64, 1e-6), Eye(2e-3, accommodation=9.9)
+    with pytest.raises(ValueError, match=r"spreads over .* samples, expected 2.1e\+06 at most; bring eyepiece and eye"):
+        plan_retina(grid, GREEN, Display.planar(10.0), eye, reach=reach)
+    coarse = Grid(64, 4e-6)
+    assert plan_retina(coarse, GREEN, Display.planar(10.0), eye, reach=reach).method == "collapse"
 
 
 def test_lines_of_a_scene_come_together_in_its_plane():
