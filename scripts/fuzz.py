@@ -1,4 +1,4 @@
-"""Mutated inputs for every parser.
+"""Mutated inputs for every parser and server.
 
 Usage: python scripts/fuzz.py [TARGET ...] --seconds 600 --seed 1
 

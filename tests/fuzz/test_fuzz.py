@@ -13,11 +13,19 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fo
 
 QUICK = ["volume-nrrd", "volume-metaimage", "image-png", "image-bmp", "config-camera", "packets", "poses", "logs"]
 FOLDERS = ["report", "resume", "export"]
+SERVERS = ["server-view", "server-page", "server-study"]
 
 
 @pytest.mark.parametrize("name", FOLDERS)
 def test_mutated_folders_of_runs_are_used_or_refused(name, tmp_path):
     count = fuzz(TARGETS[name], tmp_path, seconds=60, inputs=20)
+    assert not count.failures
+    assert count.accepted and count.refused
+
+
+@pytest.mark.parametrize("name", SERVERS)
+def test_servers_outlive_what_no_page_sends(name, tmp_path):
+    count = fuzz(TARGETS[name], tmp_path, seconds=60, inputs=40)
     assert not count.failures
     assert count.accepted and count.refused
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import gc
-import json
 import os
 import random
 import socket
@@ -15,6 +14,8 @@ from http.client import HTTPException
 from pathlib import Path
 
 import pytest
+from fuzz.requests import PORT, TOKEN
+from fuzz.targets import TARGETS
 from study_client import Runner
 
 from holotorch.experiments.perception.study import server as perception_server
@@ -22,66 +23,14 @@ from holotorch.experiments.perception.study.log import read_log
 
 PAUSE = 0.4  # seconds that the server gives a connection here
 OPEN = 48  # connections that wait for an answer meanwhile
-# Not the next trial, also where a fault has made its window the one that holds the session.
-RESULT = {"index": 1000, "window": "other", "onset_s": 1.0, "response_s": 1.2, "frame_s": 0.01, "device": "key"}
-VALUES = [
-    *("NaN", "Infinity", "-Infinity", "1e999", "-1", "0", "null", "true", '""', '"\\ud800"', "[]", "{}", "-0.0"),
-    *("1" * 4000, "[" * 900 + "]" * 900, "[" * 3000, '{"a":' * 500 + "1" + "}" * 500, '"' + "x" * 9000 + '"', "1e300"),
-]
-METHODS = ["GET", "POST", "PUT", "HEAD", "OPTIONS", "DELETE", "CONNECT", "TRACE", "PATCH", "PRI", "get", "\x01", ""]
-PATHS = [
-    *("/", "/session", "/trial", "/../participant-001.jsonl", "/..%2f..%2fetc/passwd", "//", "*", "", "/%00", "/\xff"),
-    *("http://example.org/session", "/session?x=1", "/trial#x", "/./trial", "/" + "a" * 9000, "/%", "example.org:80"),
-]
-HEADERS = [
-    *("Transfer-Encoding: chunked", "Transfer-Encoding: gzip, chunked", "Content-Encoding: gzip", "Upgrade: websocket"),
-    *("Expect: 100-continue", "Content-Length: 5", "Content-Length: -1", "Content-Length: 1e3", "Host: example.org"),
-    *("Connection: upgrade", "Connection: keep-alive", "Cookie: " + "c" * 9000, "X: " + "y" * 70_000, ": x", "a b: c"),
-    *("Origin: null", "Sec-Fetch-Site: cross-site", "Content-Type: ;;;=", "X: \r\n folded", "\xe9: \xe9", "X: \x00"),
-]
-
-
-def make_request(rng: random.Random, token: str, port: int) -> bytes:
-    """A request of the page with one to three faults, or one in five times none."""
-    faults = rng.choices(range(8), k=rng.randrange(1, 4)) if rng.random() < 0.8 else []
-    path = rng.choice(["/trial", "/session"])
-    fields = {name: json.dumps(value) for name, value in RESULT.items()}
-    if path == "/session":
-        fields = {"window": '"third"'}
-    if 0 in faults:
-        fields[rng.choice([*fields, "x"])] = rng.choice(VALUES)
-    body = ("{" + ",".join(f'"{name}":{value}' for name, value in fields.items()) + "}").encode()
-    if 1 in faults:
-        body = rng.choice([*(value.encode() for value in VALUES), body[: rng.randrange(len(body))], rng.randbytes(200)])
-    method = "POST"
-    if 2 in faults:
-        method, path = rng.choice(METHODS), rng.choice(PATHS)
-    if 3 in faults:
-        token = rng.choice(["", token[:-1], token + "x", "\xff", token.swapcase(), "x" * 8000])
-    length = str(len(body))
-    if 4 in faults:
-        length = rng.choice(["0", "3", "10000", "10001", "99999999999999999999", "x", "", "-3", "+3", "0x10", "1, 1"])
-    lines = [f"{method} {path} HTTP/1.1", f"Host: 127.0.0.1:{port}", "Content-Type: application/json"]
-    lines += [f"Authorization: Bearer {token}", f"Content-Length: {length}"]
-    if 5 in faults:
-        lines[1:1] = rng.choices(HEADERS, k=rng.choice([1, 2, 300]))
-    data = "\r\n".join([*lines, "", ""]).encode("latin-1") + body
-    if 6 in faults:
-        wrong = bytearray(data)
-        for _ in range(rng.randrange(1, 6)):
-            wrong[rng.randrange(len(wrong))] = rng.randrange(256)
-        data = bytes(wrong)
-    if 7 in faults:
-        data = data[: rng.randrange(len(data))]
-    return data
+STUDY = TARGETS["server-study"]
 
 
 def make_input(rng: random.Random, token: str, port: int) -> bytes:
-    """What one connection sends: a request, up to 50 together, or random bytes."""
-    kind = rng.random()
-    if kind < 0.05:
-        return rng.randbytes(rng.choice([1, 10, 1000, 100_000]))
-    return b"".join(make_request(rng, token, port) for _ in range(1 if kind < 0.9 else rng.randrange(2, 50)))
+    """What one connection sends: four times in five with faults."""
+    made = rng.choice(STUDY.samples(Path()))
+    data = (STUDY.mutate(rng, made, made) if rng.random() < 0.8 else made)["sent.bin"]
+    return data.replace(TOKEN, token.encode()).replace(PORT, str(port).encode())
 
 
 def answer(link: socket.socket) -> int:

@@ -34,7 +34,7 @@ from holotorch.experiments.streaming.aligning import Aligner
 from holotorch.experiments.streaming.pictures import Channel, Encoder, PanelSource
 from holotorch.experiments.streaming.registered import RegisteredVolume
 from holotorch.experiments.web.guard import Guard, headers, is_loopback
-from holotorch.experiments.web.site import file_routes, listening
+from holotorch.experiments.web.site import file_routes, listening, open_socket
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.overlay import Undistorter, overlay
@@ -199,7 +199,7 @@ class PageServer:
 
     async def _poses(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=10.0, compress=False)
-        await socket.prepare(request)
+        await open_socket(socket, request)
         client = _Client(socket, request)
         await socket.send_str(self._setup())
         if self._newest:

@@ -25,7 +25,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.view.controls import checked
 from holotorch.experiments.view.viewer import Outdated, Shown, Viewer
 from holotorch.experiments.web.guard import Guard, headers
-from holotorch.experiments.web.site import file_routes, listening
+from holotorch.experiments.web.site import file_routes, listening, open_socket
 
 _HOST = "127.0.0.1"
 _FOLDER = Path(__file__).with_name("browser")
@@ -79,7 +79,7 @@ class ViewServer:
         page = _Page(socket, request)
         self._pages.add(page)
         try:
-            await socket.prepare(request)
+            await open_socket(socket, request)
             controls = [control.described() for control in self._viewer.controls]
             setup = {"kind": "setup", "title": self._viewer.title, "note": self._viewer.note, "controls": controls}
             await socket.send_str(json.dumps(setup, allow_nan=False))

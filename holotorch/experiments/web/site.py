@@ -1,12 +1,24 @@
 """The files of a page, and a server that listens."""
 
+import logging
 import ssl
 from collections.abc import Mapping
 from pathlib import Path
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+
+
+def _ours(record: logging.LogRecord) -> bool:
+    """Whether a record is of a mistake of ours: pages that leave, and malformed requests, are not."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, ConnectionError | HttpProcessingError)
+
+
+_LOG = logging.getLogger(__name__)
+_LOG.addFilter(_ours)
 
 
 def file_routes(folder: Path, headers: Mapping[str, str]) -> list[web.RouteDef]:
@@ -21,6 +33,14 @@ def file_routes(folder: Path, headers: Mapping[str, str]) -> list[web.RouteDef]:
     return [web.get(f"/{name}", answer) for name in files]
 
 
+async def open_socket(socket: web.WebSocketResponse, request: web.Request) -> None:
+    """Open the WebSocket that a page asks for. HTTPBadRequest for a malformed request."""
+    try:
+        await socket.prepare(request)
+    except ValueError as error:  # of a key that is not ASCII, which aiohttp does not expect
+        raise web.HTTPBadRequest(text=f"no WebSocket: {error}") from None
+
+
 async def listening(
     app: web.Application, host: str, port: int, context: ssl.SSLContext | None = None
 ) -> tuple[web.AppRunner, int]:
@@ -28,7 +48,7 @@ async def listening(
 
     With ``port`` 0 the system chooses one. OSError if the port cannot be used.
     """
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0, logger=_LOG)
     await runner.setup()
     try:
         await web.TCPSite(runner, host, port, ssl_context=context, reuse_address=True).start()

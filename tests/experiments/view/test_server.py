@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import struct
@@ -95,6 +96,32 @@ def test_only_the_page_with_its_token_is_answered():
                 await session.ws_connect(address, headers=headers)
 
     served(test)
+
+
+def test_only_our_own_mistakes_are_logged(caplog):
+    """A page that left at once printed a traceback, as did malformed requests (finds of fuzzing)."""
+
+    async def test(server, session):
+        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13"
+        opening = f"GET /pictures?token={server.token} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
+        opening += f"Upgrade: websocket\r\n{key}\r\n\r\n"
+        for data in (opening, "GET //[ HTTP/1.1\r\nHost: localhost\r\n\r\n"):
+            reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+            writer.write(data.encode())
+            writer.write_eof()
+            await reader.read()
+            writer.close()
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(opening.replace("NhbX", "NhbÄ").encode())
+        assert (await reader.readline()).startswith(b"HTTP/1.1 400")
+        writer.close()
+        server._viewer.controls = None  # a mistake of ours
+        async with session.ws_connect(pictures(server)) as socket:
+            await socket.receive()
+
+    served(test)
+    (mistake,) = (record.exc_info for record in caplog.records if record.levelno >= logging.ERROR)
+    assert isinstance(mistake[1], TypeError)
 
 
 def test_a_page_gets_the_controls_and_pictures_and_refusals_in_a_line(capfd):
