@@ -47,7 +47,8 @@ def measured_crosstalk(path: str, shape: Sequence[int], key: str) -> ThermalCros
     try:
         crosstalk = ThermalCrosstalk.from_patch(rises)
     except ValueError as error:
-        raise ConfigError([f"{key}: {error}{_cure(rises)}"]) from error
+        named = str(error).replace("patch", path, 1)
+        raise ConfigError([f"{key}: {named}{_cure(rises)}"]) from error
     if rivals := _rivals(rises):
         raise ConfigError([f"{key}: {path}: {rivals}"])
     if any(taps > side for taps, side in zip(crosstalk.kernel.shape, shape, strict=True)):

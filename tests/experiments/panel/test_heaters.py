@@ -92,7 +92,7 @@ def test_a_kernel_beside_a_sigma_is_told_how_to_take_its_place(tmp_path, capsys)
     ("name", "text", "message"),
     [
         ("kernel.csv", "1,2\n3", "expected a table of temperature rises, a line for each row of pixels"),
-        ("kernel.csv", "0,1,0\n1,2,9\n0,1,0", "heated centre the warmest"),
+        ("kernel.csv", "0,1,0\n1,2,9\n0,1,0", "kernel.csv must hold rises >= 0 with the heated centre the warmest"),
         ("kernel.csv", "0,1\n1,2", "two odd sizes"),
         (
             "kernel.csv",
@@ -111,7 +111,7 @@ def test_a_kernel_beside_a_sigma_is_told_how_to_take_its_place(tmp_path, capsys)
             "pixels of row 2 are as warm as the heated pixel in the middle (1.0): is",
         ),
         ("kernel.png", "no numbers", "levels of a picture are no temperatures, write the rises as numbers"),
-        ("kernel.csv", "0,1,0\n1,nan,1\n0,1,0", "nan"),
+        ("kernel.csv", "0,1,0\n1,nan,1\n0,1,0", "kernel.csv must be finite, but element (1, 1) is nan"),
         ("kernel.npy", "no array", "expected a table"),
         ("kernel.mat", "0", "expected a heat kernel as .npy, .csv or .txt"),
     ],
