@@ -165,6 +165,7 @@ def _nested(rng: Random, holder: Any, key: Any, other: Any) -> None:
 
 
 _MOST = 50_000  # values of a tree that is written as YAML, which takes seconds
+_MOST_PARTS = 20_000  # of a JSON file; where it is nested deeply, each takes the encoder 0.1 ms
 
 _CHANGES: tuple[Callable[[Random, Any, Any, Any], None], ...] = (
     *(_replaced, _replaced, _replaced, _replaced, _scaled, _scaled, _removed, _listed, _opened, _borrowed, _borrowed),
@@ -213,8 +214,10 @@ def json_mutated(rng: Random, text: bytes, other: bytes) -> bytes:
     try:
         tree = tree_mutated(rng, json.loads(text), json.loads(other))
         made, parts = bytearray(), json.JSONEncoder(ensure_ascii=rng.random() < 0.5).iterencode(tree)
-        while len(made) < FULL and (part := next(parts, None)) is not None:  # borrowed parts may hold each other
+        for part in islice(parts, _MOST_PARTS):  # borrowed parts may hold each other
             made += part.encode("utf-8", "surrogatepass")
+            if len(made) >= FULL:
+                break
         return bytes(made)
     except RecursionError:
         return b"[" * 100_000
