@@ -35,7 +35,7 @@ Lines = tuple[Tensor | None, Tensor | None]  # complex128 [L, n] along y and x; 
 
 _LINES = 16  # per axis, fewer if their transforms together have more samples than _SAMPLES
 _SAMPLES = 2**20
-_LONGEST = 2**21  # samples of the transform of one line; a second of computing for each wavelength, focus and axis
+_LONGEST = 2**22  # samples of the transform of one line: two seconds for each wavelength, focus and axis
 _NOISE = 1024  # samples of noise per axis, for which fewer lines suffice if they are long; errors vary by about 10 %
 _FINER = 1.5  # samples of the reference for each that element-by-element propagation needs
 _WIDER = 2.0  # width of the reference's window relative to that of element-by-element propagation

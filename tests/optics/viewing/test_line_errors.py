@@ -199,7 +199,7 @@ def test_fewer_lines_predict_the_errors_of_all(view, monkeypatch):
 def test_light_that_spreads_over_too_many_samples_is_refused(reach):
     """Ten metres away, pixels of 1 um light a strip 5 m wide."""
     grid, eye = Grid(64, 1e-6), Eye(2e-3, accommodation=9.9)
-    with pytest.raises(ValueError, match=r"spreads over .* samples, expected 2.1e\+06 at most; bring eyepiece and eye"):
+    with pytest.raises(ValueError, match=r"spreads over .* samples, expected 4.2e\+06 at most; bring eyepiece and eye"):
         plan_retina(grid, GREEN, Display.planar(10.0), eye, reach=reach)
     coarse = Grid(64, 4e-6)
     assert plan_retina(coarse, GREEN, Display.planar(10.0), eye, reach=reach).method == "collapse"
