@@ -39,7 +39,7 @@ def _mistakes() -> list[str]:
     """A list to which every traceback is added that this process would print."""
     mistakes: list[str] = []
     log = logging.Handler(logging.ERROR)
-    log.emit = lambda record: mistakes.append(log.format(record))
+    log.emit = lambda record: mistakes.append(f"{record.name}: {log.format(record)}")
     logging.getLogger().addHandler(log)
     traceback.print_exc = lambda *_, **__: mistakes.append(traceback.format_exc())
     return mistakes

@@ -231,6 +231,16 @@ def test_a_disk_that_is_full_keeps_the_trial_for_later(tmp_path, monkeypatch):
     assert len(read_log(runner.log).trials) == 1
 
 
+def test_malformed_requests_are_not_logged(tmp_path, caplog, monkeypatch):
+    """Nor after other code has configured logging, which may enable all loggers (a find of fuzzing)."""
+    monkeypatch.setattr(perception_server._QUIET, "disabled", False)
+    runner = Runner(tmp_path)
+    with runner.connect(b"GET / HTTP/1.1\r\n: x\r\n\r\n") as link:
+        assert link.recv(100).startswith(b"HTTP/1.0 400")
+    runner.stop()
+    assert not caplog.records
+
+
 def test_ports(tmp_path):
     runner = Runner(tmp_path)
     taken = runner.port
