@@ -26,6 +26,20 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
     return figure_png(figure)
 
 
+def pixel_lines(image: Tensor) -> bytes:
+    """PNG of an image [3, H, W], uint8, at about twice its size, with lines that tell the positions of its pixels."""
+    height, width = image.shape[-2:]
+    spacing = next(step for step in (5, 10, 20, 50, 100, 200, 500, 1000) if max(height, width) <= 20 * step)
+    figure = Figure(figsize=(width / 50 + 1, height / 50 + 1), dpi=min(100.0, 100 * 2000 / max(height, width)))
+    axes = figure.add_axes((0.5 / (width / 50 + 1), 0.5 / (height / 50 + 1), *(s / (s + 50) for s in (width, height))))
+    axes.imshow(image.movedim(0, -1).numpy(), interpolation="nearest")
+    axes.set(xticks=range(0, width, spacing), yticks=range(0, height, spacing))
+    axes.minorticks_on()
+    axes.tick_params(which="both", top=True, right=True, labeltop=True, labelright=True)
+    axes.grid(color="white", linewidth=0.6, alpha=0.6)
+    return figure_png(figure)
+
+
 def fitted_pictures(pictures: dict[str, Tensor]) -> bytes:
     """PNG of grey pictures [..., H, W] side by side by name, each scaled to fit the first one best."""
     figure = Figure(figsize=(2.7 * len(pictures), 3.0), layout="constrained")

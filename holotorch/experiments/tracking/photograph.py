@@ -11,6 +11,7 @@ import torch
 from torch.nn import functional
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.runs.figures import pixel_lines
 from holotorch.experiments.tracking.devices import build_catheter, load_catheter, save_catheter
 from holotorch.io.bundled import find_config
 from holotorch.io.files import write_bytes
@@ -174,14 +175,18 @@ def _beside(
 
 
 def save_first_frame(video: Path, out: Path) -> str:
-    """Write the first frame of a video as a picture to ``out`` and say what to do with it. ConfigError if it cannot."""
-    pixels = _pixels(video)
+    """Write the first frame of a video to ``out``, and one with lines of pixels beside it; say what to do with them.
+
+    ConfigError if it cannot.
+    """
+    pixels, lined = _pixels(video), out.with_name(f"{out.stem}-pixels.png")
     if out.exists():
         raise ConfigError([f"{out} exists already; choose another --out, or give --bands X,Y X,Y X,Y"])
     write_bytes(out, encode_png(pixels / 255))
+    write_bytes(lined, pixel_lines(pixels))
     return (
-        f"Frame      {out}, {pixels.shape[-1]} x {pixels.shape[-2]} px: find a pixel X,Y of each band, from the tip "
-        "on, and give --bands X,Y X,Y X,Y"
+        f"Frame      {out}, {pixels.shape[-1]} x {pixels.shape[-2]} px, and with lines of X and Y {lined}: find a "
+        "pixel X,Y of each band, from the tip on, and give --bands X,Y X,Y X,Y"
     )
 
 

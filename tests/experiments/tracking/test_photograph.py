@@ -191,6 +191,11 @@ def test_without_positions_the_first_frame_of_a_video_is_saved(capsys):
     assert main(["calibrate", "catheter", "video"]) == 0
     assert "video-frame.png, 64 x 48 px" in capsys.readouterr().out
     assert np.array_equal(np.asarray(cv2.imread("video-frame.png")), frames[0])
+    lined = np.asarray(cv2.imread("video-frame-pixels.png"))
+    assert lined.shape == (48 * 2 + 100, 64 * 2 + 100, 3)
+    # Between the lines, the colours of the pixels are there, each two pixels wide.
+    for y, x in ((7, 12), (22, 33), (41, 58)):
+        assert np.abs(lined[50 + 2 * y, 50 + 2 * x].astype(int) - frames[0][y, x]).max() <= 2
     assert main(["calibrate", "catheter", "video"]) == 2
     assert "video-frame.png exists already" in capsys.readouterr().err
     assert main(["calibrate", "catheter", "none.mp4"]) == 2 and "none.mp4" in capsys.readouterr().err

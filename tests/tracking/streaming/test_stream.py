@@ -2,15 +2,17 @@
 
 import asyncio
 import math
+import re
 import socket
 
 import pytest
 import torch
+from paths import ROOT
 
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.arrivals import Statistics
 from holotorch.tracking.streaming.packet import PosePacket, decode, encode, now
-from holotorch.tracking.streaming.stream import Link, PoseReceiver, PoseSender
+from holotorch.tracking.streaming.stream import PORT, Link, PoseReceiver, PoseSender
 
 HOME = "127.0.0.1"
 REFUSED = Pose.refused(Status.NO_CATHETER, "none here")
@@ -52,6 +54,31 @@ def test_two_receivers_get_everything_and_a_dead_one_harms_nobody():
                 assert receiver.packet.pose.tip[0].item() == 0.299
 
     run(work())
+
+
+def test_the_receiver_of_the_guide_prints_poses_and_refusals(capsys):
+    page = (ROOT / "scripts" / "docs" / "tracking.md").read_text()
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.S) if "PoseReceiver" in block)
+    definition, _, call = code.partition("asyncio.run(")
+    assert f"port={PORT})" in definition and call == "receive(10))\n"
+    names: dict = {}
+    exec(definition, names)
+
+    async def work():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind((HOME, 0))
+            port = probe.getsockname()[1]
+        receiving = asyncio.create_task(names["receive"](2, port))
+        async with PoseSender([(HOME, port)]) as sender:
+            number = 0
+            while not receiving.done():
+                sender.send(REFUSED if number % 2 else pose(0.125), now())
+                number += 1
+                await asyncio.sleep(0.005)
+
+    run(work())
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and all(line.startswith("[0.125, ") or line == REFUSED.reason for line in lines)
 
 
 def test_a_slow_reader_gets_the_newest_not_a_backlog():
