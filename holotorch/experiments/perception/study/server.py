@@ -132,7 +132,8 @@ class StudyServer:
         # Pages of other origins can send forms here, but JSON only with a CORS permission, which is not given.
         paths = ("/session", "/trial", "/gaze", "/fixation") if self.session.gaze else ("/session", "/trial")
         accepted = request.method == "POST" and request.path in paths
-        if not accepted or request.content_type != "application/json":
+        kind = request.headers.get("Content-Type", "").partition(";")[0]  # Python's parser recurses into comments
+        if not accepted or kind.strip().lower() != "application/json":
             raise web.HTTPNotFound(text=f"expected JSON at {', '.join(paths[:-1])} or {paths[-1]}")
         value = await _read_json(request)
         if request.path == "/gaze":

@@ -95,6 +95,10 @@ def test_results_that_cannot_be_are_refused(tmp_path):
     assert runner.ask("POST", "/trial", [1])[0] == 400
     assert runner.ask("POST", "/trial", b" " * 10_001)[0] == 400
     assert runner.ask("POST", "/trial", {}, **{"Content-Type": "text/plain"})[0] == 404  # what a foreign page can send
+    assert (
+        runner.ask("POST", "/session", {"window": "w"}, **{"Content-Type": "Application/JSON; charset=utf-8"})[0] == 200
+    )
+    assert runner.ask("POST", "/trial", {}, **{"Content-Type": "(" * 3000})[0] == 404  # a find of fuzzing
     assert runner.ask("GET", "/../secrets")[0] == 404
     for foreign in ("evil.example:80", "evil.example", ""):
         assert runner.ask("POST", "/session", {"window": "x"}, Host=foreign)[0] == 403
