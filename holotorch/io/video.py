@@ -21,6 +21,7 @@ _TEXTS = (".txt", ".nfo", ".diz", ".ans")  # FFmpeg, which OpenCV opens videos w
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}  # four-character code of the codec for each file extension
 _ASSUMED_RATE = 30.0  # Hz; frame rate of sources that state none
+_HALF_COLOURS = (b"I420", b"IYUV", b"YV12", b"NV12", b"NV21", b"P010")  # formats of pixels, as FFmpeg names them
 
 
 class Frame(NamedTuple):
@@ -46,6 +47,7 @@ class Frames:
         frames: Iterator over the frames.
         notes: Remarks for the user, such as that a rate was assumed; some are added after the last frame.
         live: Whether the source is a camera, which does not end.
+        coarse_colours: Whether a file is known to hold colours at half the resolution (4:2:0).
         close: Function that closes the source; None if ``frames`` does so itself.
     """
 
@@ -57,6 +59,7 @@ class Frames:
     notes: list[str]
     _: KW_ONLY
     live: bool = False
+    coarse_colours: bool = False
     close: Callable[[], None] | None = None
 
     def __iter__(self) -> Iterator[Frame]:
@@ -159,7 +162,9 @@ def _video(path: Path, rate: float | None) -> Frames:
             notes.append(f"{path.name} announces {announced} frames and {count} could be read")
 
     total, shape = announced if announced > 0 else None, first.shape[:2]
-    return Frames(path.name, shape, total, stated, frames(), notes, close=capture.release)
+    stored = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) & 0xFFFFFFFF
+    coarse = stored.to_bytes(4, "little") in _HALF_COLOURS
+    return Frames(path.name, shape, total, stated, frames(), notes, coarse_colours=coarse, close=capture.release)
 
 
 def _decoded(read: Callable[[], tuple[bool, Any]]) -> Any:

@@ -31,6 +31,7 @@ def test_a_written_video_comes_back_with_its_times(tmp_path, name):
             video.write(picture(value))
     with open_frames(path) as frames:
         assert (frames.shape, frames.total, frames.rate, frames.live) == ((48, 64), 10, 12.5, False)
+        assert frames.coarse_colours
         found = list(frames)
     assert [frame.seconds for frame in found] == pytest.approx([i / 12.5 for i in range(10)], abs=1e-9)
     assert not frames.notes
@@ -194,6 +195,15 @@ def test_the_first_frame_of_a_camera_has_the_time_at_which_it_was_read(monkeypat
         opened = time.monotonic()
         first, second = frames
     assert first.seconds <= opened <= second.seconds
+
+
+def test_a_codec_that_keeps_all_colours_is_told_from_those_that_halve_them(tmp_path):
+    path = tmp_path / "a.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 25.0, (64, 48))
+    video.write(np.zeros((48, 64, 3), np.uint8))
+    video.release()
+    with open_frames(path) as frames:
+        assert not frames.coarse_colours
 
 
 def test_frames_without_times_of_their_own_are_counted_and_that_is_said(tmp_path, monkeypatch):

@@ -16,16 +16,20 @@ _FULL, HALF = 0.024, 0.15
 _NEAREST, _FARTHEST, _STEPS = 0.02, 20.0, 700  # metres; steps of 1 %
 
 
-def range_text(camera: Camera, catheter: Catheter) -> str:
-    """Lines with the largest distances at which ``CatheterTracker`` finds the tip, and what limits the first."""
+def range_text(camera: Camera, catheter: Catheter, coarse_colours: bool = False) -> str:
+    """Lines with the largest distances at which ``CatheterTracker`` finds the tip, and what limits the first.
+
+    ``coarse_colours``: whether the frames are known to have colours at half the resolution.
+    """
     distance, reason = working_range(camera, catheter)
     half, _ = working_range(camera, catheter, HALF)
     focal, shortest = _focal(camera), _shortest(catheter)
+    which = "as this file has" if coarse_colours else "as of most webcams and video files"
     return (
         f"Range      the bands may be up to about {distance:.2g} m from the camera (in full view, good light and full "
         f"colours): there the shortest one, {1e3 * shortest:.3g} mm, is {focal * shortest / distance:.0f} px long and "
         f"the tube {2 * focal * catheter.radius / distance:.1f} px wide; beyond, {reason}\n"
-        f"           in colours of half the resolution, as of most webcams and video files, up to about {half:.2g} m"
+        f"           in colours of half the resolution, {which}, up to about {half:.2g} m"
     )
 
 

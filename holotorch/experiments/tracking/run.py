@@ -194,7 +194,7 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"
     count = "without end; Ctrl-C ends it" if frames.live else count
     lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
-    lines.append(range_text(experiment.inputs.camera, experiment.inputs.catheter))
+    lines.append(range_text(experiment.inputs.camera, experiment.inputs.catheter, frames.coarse_colours))
     if isinstance(experiment.inputs.tracker, CatheterTracker) and (readout := experiment.inputs.tracker.readout):
         lines.append(
             f"Shutter    deviations (sd) allow for a catheter that moves by {1e3 * readout:g} mm while a rolling "

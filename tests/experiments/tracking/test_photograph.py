@@ -252,5 +252,7 @@ def test_more_pixels_see_farther():
     tool = World().catheter
     near, far = (working_range(synthetic_camera(size), tool)[0] for size in ((540, 960), (1080, 1920)))
     assert far == pytest.approx(2 * near, rel=1e-9)
-    assert range_text(synthetic_camera(), tool).startswith("Range      the bands may be up to about 1.2 m")
+    text = range_text(synthetic_camera(), tool)
+    assert text.startswith("Range      the bands may be up to about 1.2 m") and "as of most webcams" in text
+    assert "half the resolution, as this file has, up to" in range_text(synthetic_camera(), tool, coarse_colours=True)
     assert torch.isfinite(torch.tensor(far))
