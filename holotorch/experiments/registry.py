@@ -43,6 +43,8 @@ def run_name(config: Path | str, overrides: list[str], kind: str) -> str:
     value: Any = given.data
     for part in find_kind(kind).data.split("."):
         value = value.get(part) if isinstance(value, dict) else None
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
     path = Path(value.split("::")[0]) if isinstance(value, str) else None
     if path is None or not path.exists():  # such as the name of a bundled picture
         return Path(config).stem

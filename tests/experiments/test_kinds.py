@@ -2,6 +2,7 @@
 
 import json
 import signal
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -125,6 +126,9 @@ def test_every_kind_has_settings_of_its_own_name(name):
         ("joint/teapot.yaml", "steps=3", "teapot"),
         ("tracking/track.yaml", "source=my film.mp4", "my film-track"),
         ("tracking/track.yaml", "source=0", "track"),  # a camera
+        ("tracking/measure.yaml", "source=['my film.mp4']", "my film-measure"),
+        ("tracking/measure.yaml", "source=[slices, 'my film.mp4']", "measure"),  # the faces of a grid
+        ("tracking/measure.yaml", "source=[synthetic]", "measure"),
         ("perception/layout.yaml", "seed=3", "layout"),
     ],
 )
@@ -133,8 +137,8 @@ def test_a_run_is_named_after_the_data_of_the_user_or_its_configuration(config, 
     monkeypatch.chdir(tmp_path / "work")
     for file in ("my photo.png", "my film.mp4", "head.v2.nii.gz", "ct.h5"):
         (tmp_path / "work" / file).touch()
-    folder = config.split("/")[0].replace("tracking", "track").replace("perception", "perception_layout")
-    assert run_name(f"configs/{config}", ["seed=1", word], folder) == name
+    kind = {"track": "track", "measure": "measure", "layout": "perception_layout"}.get(Path(config).stem)
+    assert run_name(f"configs/{config}", ["seed=1", word], kind or config.split("/")[0]) == name
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -1,6 +1,7 @@
 """Arguments and action of ``measure``. Other modules are imported only when the command runs."""
 
 import argparse
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ def add_measure(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     measure.add_argument("protocol", metavar="PROTOCOL", help="still, grid2d, grid3d, latency, prediction, edges, tone")
     what = "video, folder of pictures or of a recording, number of a camera, run of track, poses.csv, or: synthetic"
     measure.add_argument("sources", nargs="*", metavar="SOURCE", help=f"{what}; for grid3d one for each face")
-    measure.add_argument("--out", type=Path, help="folder of the run (default: runs/measure-001, ...)")
+    measure.add_argument("--out", type=Path, help="folder of the run (default: runs/SOURCE-measure-001, ...)")
     measure.add_argument("--camera", help="its intrinsics: a YAML file, as calibrate writes it")
     measure.add_argument("--catheter", help="YAML file, such as configs/tracking/catheter.yaml")
     measure.add_argument("--rate", type=float, metavar="HZ", help="frames per second of a source without times")
@@ -37,10 +38,13 @@ def add_measure(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
 
 def _measure(options: argparse.Namespace) -> int:
     from holotorch.experiments.execute import execute, print_outcome
+    from holotorch.experiments.registry import run_name
 
     if options.print is not None:
         return _print_sheet(options)
-    folder, complete = execute(_settings(options), options.out, "measure")
+    settings = _settings(options)
+    name = run_name("measure", [f"source={json.dumps(options.sources)}"], "measure")
+    folder, complete = execute(settings, options.out, name)
     print_outcome(folder)
     return OK if complete else INTERRUPTED
 

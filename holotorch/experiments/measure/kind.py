@@ -21,6 +21,7 @@ class MeasureKind(ExperimentKind[MeasureSettings, "Measurement"]):
     """See :mod:`holotorch.experiments.kind`."""
 
     settings = MeasureSettings
+    data = "source"
     example = "configs/tracking/measure.yaml"
 
     def contradictions(self, settings: MeasureSettings) -> list[tuple[Key, str]]:
