@@ -93,7 +93,7 @@ def plan_measurement(experiment: Measurement) -> RunPlan:
             total = source.inputs.frames.total
             count = "without end; Ctrl-C ends it" if source.live else f"{total or 'an unknown number of'} frames"
         lines.append(f"Source     {source.name}: {count}")
-        lines += source.remarks
+        lines += [f"Note       {remark}" for remark in source.remarks]
     return RunPlan("\n".join(lines))
 
 
@@ -132,7 +132,7 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     complete = conclude(folder, without_nan(summary), files, done=True)
     for note in result.notes:
         if note not in announced:
-            print(note, flush=True)
+            print(f"Note       {note}", flush=True)
     return complete
 
 

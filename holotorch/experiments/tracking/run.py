@@ -122,7 +122,7 @@ def live(
 def _live(inputs: TrackingInputs, see: Callable[[Tensor, Pose, float], None] | None) -> Iterator[tuple[float, Pose]]:
     with inputs.frames as frames:
         for note in frames.notes:
-            print(note, flush=True)
+            print(f"Note       {note}", flush=True)
         printed, start = len(frames.notes), None
         for item in _followed(frames, inputs):
             start = now() - item.frame.seconds if start is None else start
@@ -132,7 +132,7 @@ def _live(inputs: TrackingInputs, see: Callable[[Tensor, Pose, float], None] | N
                 see(item.frame.pixels, item.pose, captured)
             yield captured, item.pose
         for note in frames.notes[printed:]:
-            print(note, flush=True)
+            print(f"Note       {note}", flush=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,7 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
         if frames.total is not None:
             text = f"{recording_bytes(frames.shape, frames.total) / 1e9:.3f} GB; {free / 1e9:.1f} GB free here"
         lines.append(f"Recording  {text}")
-    return RunPlan("\n".join([*lines, *frames.notes]))
+    return RunPlan("\n".join([*lines, *(f"Note       {note}" for note in frames.notes)]))
 
 
 def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
@@ -275,7 +275,8 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         if failure is not None:
             summary["failure"] = f"{type(failure).__name__}: {failure}"
         # After a failure nothing prints the verdict later.
-        lines = [*([] if failure is None else [verdict(summary)]), *summary["notes"][printed:]]
+        lines = [verdict(summary)] if failure is not None else []
+        lines += [f"Note       {note}" for note in summary["notes"][printed:]]
         print(*lines, sep="\n", end="\n" if lines else "", flush=True)
         results.write(save_figure, folder, log)
         if failure is not None:
