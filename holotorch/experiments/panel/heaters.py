@@ -133,15 +133,16 @@ def heaters_text(report: dict[str, Any]) -> str:
             "rad; use more bits, or compute the run for them (modulator.bits of kind pec)"
         )
     return (
-        f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s): heater_*: phases in rad that each "
-        f"heater alone causes at its own pixel, before the heat spreads (a step of the PNG is {step:.4g} rad, "
-        f"{report['heater_bits']} bits, so that few bits look black in a viewer; *_levels.csv has the integers); "
-        "rise_*: the same as K above ambient, for a driver that takes temperatures; temperature_*: K above ambient "
-        f"after spreading, at most {report['peak_temperature_K']:.0f}; optical_*: phases of the light in rad after "
-        "spreading, not modulo 2 pi. What fewer bits cost, holotorch view of the run shows (Levels of the heaters), "
-        "and modulator.bits "
-        "of kind pec computes a run for them. A liquid-crystal panel "
-        "needs holotorch export-slm instead" + warning
+        f"{report['frames']} frame(s), {len(report['wavelengths_m'])} colour(s)\n"
+        "heater_*       phases in rad that each heater alone causes at its own pixel, before the heat spreads; a step "
+        f"of the PNG is {step:.4g} rad, {report['heater_bits']} bits, so that few bits look black in a viewer; "
+        "*_levels.csv has the integers\n"
+        "rise_*         the same as K above ambient, for a driver that takes temperatures\n"
+        f"temperature_*  K above ambient after spreading, at most {report['peak_temperature_K']:.0f}\n"
+        "optical_*      phases of the light in rad after spreading, not modulo 2 pi\n"
+        "Note           holotorch view of the run shows what fewer bits cost (Levels of the heaters), and "
+        "modulator.bits of kind pec computes a run for them; a liquid-crystal panel needs holotorch export-slm instead"
+        + warning
     )
 
 

@@ -40,7 +40,7 @@ def _number_type(value: Any) -> Any:
 
 def _in_front(value: float) -> float:
     if not value > 0:
-        raise PydanticCustomError("depth", "expected a distance above zero: the scene lies in front of the hologram")
+        raise PydanticCustomError("depth", "expected a distance above zero, from the hologram or array to the scene")
     return value
 
 
