@@ -30,8 +30,9 @@ def pixel_lines(image: Tensor) -> bytes:
     """PNG of an image [3, H, W], uint8, at about twice its size, with lines that tell the positions of its pixels."""
     height, width = image.shape[-2:]
     spacing = next(step for step in (5, 10, 20, 50, 100, 200, 500, 1000) if max(height, width) <= 20 * step)
-    figure = Figure(figsize=(width / 50 + 1, height / 50 + 1), dpi=min(100.0, 100 * 2000 / max(height, width)))
-    axes = figure.add_axes((0.5 / (width / 50 + 1), 0.5 / (height / 50 + 1), *(s / (s + 50) for s in (width, height))))
+    wide, high = width / 50 + 1, height / 50 + 1  # inches, with half an inch of margin on each side
+    figure = Figure(figsize=(wide, high), dpi=min(100.0, 100 * 2000 / max(height, width)))
+    axes = figure.add_axes((0.5 / wide, 0.5 / high, 1 - 1 / wide, 1 - 1 / high))
     axes.imshow(image.movedim(0, -1).numpy(), interpolation="nearest")
     axes.set(xticks=range(0, width, spacing), yticks=range(0, height, spacing))
     axes.minorticks_on()
