@@ -29,7 +29,7 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
 def pixel_lines(image: Tensor) -> bytes:
     """PNG of an image [3, H, W], uint8, at about twice its size, with lines that tell the positions of its pixels."""
     height, width = image.shape[-2:]
-    spacing = next(step for step in (5, 10, 20, 50, 100, 200, 500, 1000) if max(height, width) <= 20 * step)
+    spacing = next((step for step in (5, 10, 20, 50, 100, 200, 500) if max(height, width) <= 20 * step), 1000)
     wide, high = width / 50 + 1, height / 50 + 1  # inches, with half an inch of margin on each side
     figure = Figure(figsize=(wide, high), dpi=min(100.0, 100 * 2000 / max(height, width)))
     axes = figure.add_axes((0.5 / wide, 0.5 / high, 1 - 1 / wide, 1 - 1 / high))

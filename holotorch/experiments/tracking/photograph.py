@@ -180,8 +180,8 @@ def save_first_frame(video: Path, out: Path) -> str:
     ConfigError if it cannot.
     """
     pixels, lined = _pixels(video), out.with_name(f"{out.stem}-pixels.png")
-    if out.exists():
-        raise ConfigError([f"{out} exists already; choose another --out, or give --bands X,Y X,Y X,Y"])
+    if existing := [path for path in (out, lined) if path.exists()]:
+        raise ConfigError([f"{existing[0]} exists already; choose another --out, or give --bands X,Y X,Y X,Y"])
     write_bytes(out, encode_png(pixels / 255))
     write_bytes(lined, pixel_lines(pixels))
     return (

@@ -40,7 +40,7 @@ _STEP_S = 0.01  # interval between the checks of a waiting request
 _HEADERS = headers("")
 # aiohttp would log every malformed request with a traceback; StudyServer prints the errors of its own code.
 _QUIET = logging.getLogger(f"{__name__}.requests")
-_QUIET.addFilter(lambda _: False)  # other than ``disabled``, it outlives a configuration of logging by others
+_QUIET.addFilter(lambda _: False)  # unlike ``disabled``, it outlives a configuration of logging by others
 
 
 class _Connections(web.Server):
