@@ -173,7 +173,7 @@ def _check_axes(folder: Path, experiment: PECExperiment, heaters: Tensor) -> Non
     try:
         numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
         light = None if numbers is None else torch.tensor(numbers, dtype=torch.float64)[experiment.lit]
-    except (ValueError, AttributeError, TypeError, LookupError, RuntimeError):
+    except (ValueError, AttributeError, TypeError, LookupError, RuntimeError, OverflowError):
         raise ValueError("summary.json is damaged: it does not say the heating power of each colour") from None
     if not len(heaters) == heaters.shape[1] > 1 or light is None:
         return

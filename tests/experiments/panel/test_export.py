@@ -230,6 +230,11 @@ def test_colours_before_frames_are_refused_where_no_shape_tells(pec, tmp_path):
         load_panel_phases(copy)
     np.save(copy / "arrays" / "phase.npy", three * 2)  # another solution of neither order is taken at its word
     assert load_panel_phases(copy).phase.shape == (3, 3, 32, 24)
+    for damaged in ([10**400, 1.0, 1.0], ["x", 1.0, 1.0]):  # the first is a find of fuzzing
+        told["heating_power_K_per_pixel"] = damaged
+        summary.write_text(json.dumps(numbers))
+        with pytest.raises(ConfigError, match=r"summary.json is damaged: it does not say the heating power"):
+            load_panel_phases(copy)
 
 
 def test_damaged_runs_are_refused(pec, tmp_path):
