@@ -104,7 +104,7 @@ def _finished_run() -> Path:
 
 
 def _exchange(served: _Served, data: bytes, *, until: bytes | None = None) -> bytes:
-    """Send ``data``, and receive what is answered, or as far as ``until``; TimeoutError if that does not come."""
+    """Send ``data``, and receive what is answered, or up to ``until``; TimeoutError if that does not come."""
     data = data.replace(TOKEN, served.token.encode()).replace(PORT, str(served.port).encode())
     answer = b""
     ends = (ConnectionError, TimeoutError) if until is None else ()

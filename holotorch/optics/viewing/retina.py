@@ -108,7 +108,8 @@ def plan_retina(
         tolerance, the cheapest one whose expected error is at most 0.5.
 
     Raises:
-        ValueError: Invalid arguments, no method within the memory limit, or an expected error above 0.5.
+        ValueError: Invalid arguments, no method within the memory limit, an expected error above 0.5, or light of a row
+            or column of the hologram that spreads over more than 2**22 samples.
     """
     wavelengths = checks.wavelengths(wavelengths)
     limit_of_error = TOLERANCE if tolerance is None else checks.positive("tolerance", tolerance)
