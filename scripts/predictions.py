@@ -142,10 +142,10 @@ def main() -> None:
         runs, compare = {f"chart {name}": [name] for name, subject in CHARTS.items() if subject.gigabytes}, _chart
     title = "run: predicted s, measured s (of which the processor worked), measured / predicted"
     lines = [title if compare is _seconds else "run: stated GB, measured GB at the peak, stated / measured"]
-    ratios = []
-    for name, words in runs.items():
-        if not name.startswith(options.only):
-            continue
+    ratios, chosen = [], {name: words for name, words in runs.items() if name.startswith(options.only)}
+    if not chosen:
+        parser.error(f"--only {options.only}: expected the beginning of one of {', '.join(runs)}")
+    for name, words in chosen.items():
         said, ratio = compare(words)
         ratios.append(ratio)
         lines.append(f"{name}: {said}")

@@ -48,6 +48,7 @@ class Frames:
         notes: Remarks for the user, such as that a rate was assumed; some are added after the last frame.
         live: Whether the source is a camera, which does not end.
         coarse_colours: Whether a file is known to hold colours at half the resolution (4:2:0).
+        recorded_from: Name of the source of which the frames are a recording; empty for others.
         close: Function that closes the source; None if ``frames`` does so itself.
     """
 
@@ -60,6 +61,7 @@ class Frames:
     _: KW_ONLY
     live: bool = False
     coarse_colours: bool = False
+    recorded_from: str = ""
     close: Callable[[], None] | None = None
 
     def __iter__(self) -> Iterator[Frame]:

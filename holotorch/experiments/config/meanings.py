@@ -86,6 +86,7 @@ MEANINGS = {
     "EyeSettings.pupil_radius": "radius of the pupil",
     "EyeSettings.axial_length": "distance from the pupil to the retina",
     "EyeSettings.chromatic": "chromatic aberration of the human eye",
+    "ObserverSettings.scale": "divides pixels, rays, distances and width of the scene, in place of its own scale",
     "LightSettings.sources": "light sources to compare (FWHM 1.4, 5, 10 and 20 nm)",
     "SweepSettings.steps": "depths at which the eye is focused in turn",
     "SweepSettings.bands": "parts of the scene by depth",
@@ -95,7 +96,7 @@ MEANINGS = {
     "JointSettings.frames": "heater patterns shown in turn",
     "JointReport.baselines": "methods that the result is compared with",
     # Tracking and its measurement.
-    "TrackSettings.frames": "frames of a synthetic recording",
+    "TrackSettings.frames": "frames of a synthetic recording, by default 45; of another source, all are tracked",
     "TrackSettings.method": "this tracker, or that of the dissertation",
     "MeasureSettings.protocol": "what is measured",
     "RestSettings.seconds": "least duration of a rest of the tip",

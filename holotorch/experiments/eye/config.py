@@ -1,8 +1,8 @@
 """Settings of an observer's view of a hologram."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, field_serializer
 from pydantic_core import PydanticCustomError
 
 from holotorch.core.quantities import DEPTH, EYE_LENGTH, FOCAL_LENGTH, PUPIL_RADIUS, SPACING
@@ -18,7 +18,7 @@ from holotorch.experiments.config.settings import (
     plausible,
     several,
 )
-from holotorch.experiments.volume.config import TransferSettings, VolumeSource
+from holotorch.experiments.volume.config import Scale, TransferSettings, ViewSettings, VolumeSource
 from holotorch.io.bundled import find_config
 
 Source = Literal["laser", "narrow_sled", "sled", "led"]
@@ -126,7 +126,8 @@ class ObserverSettings(Settings):
     """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
     ``volume``: a volume in place of the scene's, as in runs of kind volume. ``transfer``: its colours and opacities, as
-    in these runs. ``wavelengths``: wavelengths of the hologram, in place of the scene's.
+    in these runs. ``view``: keys in place of those of the scene's view, which keeps the others. ``scale``: in place of
+    the scene's. ``wavelengths``: wavelengths of the hologram, in place of the scene's.
     ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the visible
     depths. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times as
     many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina, divided between
@@ -137,8 +138,7 @@ class ObserverSettings(Settings):
     """
 
     elsewhere: ClassVar[dict[str, str]] = {
-        key: f"the scene has it; write 'scene.change=[\"{key}.KEY=VALUE\"]', or give a scene.config of your own"
-        for key in ("hologram", "view")
+        "hologram": "the scene has it; write 'scene.change=[\"hologram.KEY=VALUE\"]', or another scene.config"
     }
 
     experiment: Literal["eye"]
@@ -146,6 +146,8 @@ class ObserverSettings(Settings):
     scene: SceneSettings
     volume: VolumeSource | None = None
     transfer: TransferSettings | None = None
+    view: ViewSettings | None = None
+    scale: Scale | None = None
     wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)] | None = None
     display: Annotated[MagnifyingSettings | PlanarSettings | SphericalSettings, Field(discriminator="kind")]
     eye: EyeSettings = EyeSettings()
@@ -155,3 +157,8 @@ class ObserverSettings(Settings):
     tolerance: Annotated[Number, Field(gt=0, lt=1)] | None = None
     sweep: SweepSettings | None = None
     tradeoff: Annotated[tuple[Annotated[Positive, plausible(DEPTH)], ...], BeforeValidator(several)] = ()
+
+    @field_serializer("view")
+    def _as_given(self, view: ViewSettings | None) -> dict[str, Any] | None:
+        """Only the keys that were given: all others, also with their defaults, would replace those of the scene."""
+        return None if view is None else view.model_dump(mode="json", exclude_unset=True)

@@ -1,5 +1,6 @@
 """Plan of a run of kind ``eye``: methods, cost and geometry, before anything is computed."""
 
+import json
 import math
 from typing import Any
 
@@ -120,6 +121,11 @@ def _scene(eye: Observer) -> str:
     source = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
     if changes := eye.settings.scene.change:
         source += f" and scene.change: {', '.join(changes)}"
+    given = {} if (view := eye.settings.view) is None else view.model_dump(mode="json", exclude_unset=True)
+    words = [f"view.{key}={json.dumps(value)}" for key, value in given.items()]
+    words += [] if (scale := eye.settings.scale) is None else [f"scale={scale}"]
+    if words:
+        source += f"; {', '.join(words)}"
     return "; ".join(filter(None, (source, volume_plan.preset_note(eye.scene))))
 
 

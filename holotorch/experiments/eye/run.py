@@ -52,8 +52,12 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     if not isinstance(scene, VolumeSettings):
         raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {scene.experiment!r}"])
     overrides = {
-        name: value for name in ("volume", "transfer", "wavelengths") if (value := getattr(settings, name)) is not None
+        name: value
+        for name in ("volume", "transfer", "scale", "wavelengths")
+        if (value := getattr(settings, name)) is not None
     }
+    if (view := settings.view) is not None:
+        overrides["view"] = scene.view.model_copy(update={name: getattr(view, name) for name in view.model_fields_set})
     scene = scene.model_copy(update=overrides)
     if problems := contradictions(scene):
         raise ConfigError([f"{'.'.join(map(str, key))}: {problem}" for key, problem in problems])
@@ -112,7 +116,7 @@ def _fingerprint(eye: Observer) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
     settings, inputs, free = fingerprint_inputs(eye.scene)
     scene = fingerprint(settings, inputs, {*free, "report"})
-    observer = fingerprint(eye.settings, {}, {"seeds", "sweep", "tradeoff", "scene"})
+    observer = fingerprint(eye.settings, {}, {"seeds", "sweep", "tradeoff", "scene", "view", "scale"})
     return observer | {f"scene.{key}": value for key, value in scene.items()}
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.measure.config import MeasureSettings
 from holotorch.experiments.measure.source import Source
-from holotorch.experiments.tracking.devices import CameraSettings, load_camera, save_catheter, save_tone
+from holotorch.experiments.tracking.devices import CameraSettings, load_camera, load_catheter, save_catheter, save_tone
 from holotorch.io.bundled import find_config
 from holotorch.io.video import Frames, open_frames
 from holotorch.tracking import Camera, Catheter
@@ -35,6 +35,7 @@ class MeasuredCatheter:
         edges: Positions in metres and their covariance.
         used, left_out: Numbers of frames in the fit, and of those whose edges disagree with the others.
         rms_px: Root mean square of the residuals along and across the tool, in pixels.
+        colours_from: Source of the colours of the nominal catheter.
     """
 
     catheter: Catheter
@@ -43,10 +44,11 @@ class MeasuredCatheter:
     used: int
     left_out: int
     rms_px: float
+    colours_from: str | None = None
 
     def save(self, path: Path) -> None:
         """Write the catheter's file."""
-        save_catheter(path, self.catheter)
+        save_catheter(path, self.catheter, self.colours_from)
 
 
 def known_distances(arguments: Sequence[str]) -> list[int | tuple[int, int]]:
@@ -92,7 +94,8 @@ def measure_catheter(
         raise ConfigError([f"{source.name}: {error}"]) from None
     used = int(kept.sum())
     rms = 0.1 * math.sqrt(fit.chi_square / max(fit.freedom, 1))  # the fit assumes 0.1 px
-    return MeasuredCatheter(catheter, nominal, fit, used, len(kept) - used, rms)
+    colours_from = load_catheter(source.inputs.paths["catheter.yaml"]).colours_from
+    return MeasuredCatheter(catheter, nominal, fit, used, len(kept) - used, rms, colours_from)
 
 
 def catheter_rows(measured: MeasuredCatheter) -> list[dict[str, Any]]:

@@ -18,14 +18,18 @@ from holotorch.io.files import read_json
 
 _SIDE, _SECONDS = 512, 0.06  # samples along each side of the transform that is timed, and time spent on it
 _GAIN = 1.5  # ratio of times above which fewer threads are taken
+_FULL = 0.85  # share of a processor's time below which predicted seconds are said to be too few
+_WATCHED = 0.2  # seconds over which that share is measured: other programs take turns of some milliseconds
 
 
 @contextmanager
 def undisturbed(resumed: Path | None = None) -> Iterator[None]:
     """Compute within this block with fewer threads if that is faster now, and say so.
 
-    OMP_NUM_THREADS, where it is set, is followed. A run that is ``resumed`` goes on with as many threads as it was
-    begun with, since sums of another number of threads are rounded otherwise. The number of before is restored.
+    Where other programs take a part of the processor's time, a line says by how much the predicted seconds, those of an
+    idle machine, fall short. OMP_NUM_THREADS, where it is set, is followed, and nothing is measured. A run that is
+    ``resumed`` goes on with as many threads as it was begun with, since sums of another number of threads are rounded
+    otherwise. The number of before is restored.
     """
     before = torch.get_num_threads()
     chosen, why = before, "other programs use the processors"
@@ -35,6 +39,8 @@ def undisturbed(resumed: Path | None = None) -> Iterator[None]:
     if chosen != before:
         print(f"Threads    {chosen}, not {before}: {why} (OMP_NUM_THREADS={before} before the command changes that)")
     torch.set_num_threads(chosen)  # the comparison has changed it
+    if "OMP_NUM_THREADS" not in os.environ and (share := _share()) < _FULL:
+        print(f"Busy       this takes about {1 / share:.1f} times the predicted seconds, which are of an idle machine")
     try:
         yield
     finally:
@@ -62,6 +68,14 @@ def _mean_seconds(threads: int) -> float:
         fft2(samples)
         count += 1
     return seconds / max(1, count)
+
+
+def _share() -> float:
+    """Share of a processor's time that this thread gets now."""
+    began, worked = time.perf_counter(), time.thread_time()
+    while (seconds := time.perf_counter() - began) < _WATCHED:
+        pass
+    return (time.thread_time() - worked) / seconds
 
 
 def _begun(folder: Path) -> int | None:

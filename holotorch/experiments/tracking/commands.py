@@ -90,11 +90,12 @@ def _calibrate(options: argparse.Namespace) -> int:
 
     if options.files[0] == Path("catheter"):
         from holotorch.experiments.tracking.photograph import calibrate_catheter, save_first_frame
+        from holotorch.experiments.tracking.source import first_frame
         from holotorch.io.video import PICTURES
 
         alone = len(options.files) == 2 and not (options.board or options.axes)
         if alone and not options.bands and options.files[1].suffix.lower() not in PICTURES:
-            print(save_first_frame(options.files[1], options.out or Path(f"{options.files[1].stem}-frame.png")))
+            print(save_first_frame(options.files[1], options.out or first_frame(options.files[1])))
             return OK
         if not alone or not options.bands:
             expected = "calibrate catheter: expected one photograph and --bands X,Y X,Y X,Y, without --board and --axes"

@@ -19,8 +19,9 @@ class TrackSettings(Settings):
     """Tracking of a catheter in a video, a folder of pictures, a recording, or the frames of a live camera.
 
     ``source``: a path, the index of a camera, or ``synthetic``. A synthetic run first renders a recording of
-    ``frames`` frames with true poses. ``camera``: YAML file of its intrinsics, as ``holotorch calibrate`` writes it; by
-    default, that beside the recording, or a synthetic camera if ``source`` is ``synthetic``. ``catheter``: YAML file of
+    ``frames`` frames with true poses, 45 by default; of other sources, all frames are tracked. ``camera``: YAML file of
+    its intrinsics, as ``holotorch calibrate`` writes it; by default, that beside the recording, or a synthetic camera
+    if ``source`` is ``synthetic``. ``catheter``: YAML file of
     its bands; by default, that beside the recording, or the dissertation's catheter. ``headset``: YAML file of the
     camera's place on a headset; poses are also written in its frame. ``record``: save every frame without loss for a
     later run. ``video``: write a video with the pose drawn on every frame; of a synthetic recording also one without.
@@ -33,10 +34,15 @@ class TrackSettings(Settings):
     camera: str | None = None
     catheter: str | None = None
     headset: str | None = None
-    frames: Count = FRAMES
+    frames: Count | None = None
     method: Literal["ours", "thesis"] = "ours"
     record: bool = False
     video: bool = True
     still: bool = False
     rate_hz: Annotated[Number, Field(gt=0)] | None = None
     batch: Annotated[Count, Field(le=64)] = 1  # 64 frames of 1080 x 1920 px take 400 MB
+
+    @property
+    def rendered(self) -> int:
+        """Frames of a synthetic recording."""
+        return FRAMES if self.frames is None else self.frames

@@ -87,12 +87,15 @@ class CatheterSettings(Settings):
 
     ``edges``: distances of the band edges from the tip, four or more, since those of two bands leave no pose that could
     be verified. ``colours``: sRGB triples, one for each band; bands touch each other, so there is one less than edges.
+    ``colours_from``: name of the picture or video from which the colours were read; in its frames, the order of the
+    colour channels cannot be wrong.
     """
 
     edges: Annotated[tuple[Annotated[Length, plausible(TOOL_POSITION)], ...], Field(min_length=4)]
     colours: tuple[Colour, ...]
     radius: Annotated[Length, plausible(TOOL_RADIUS)]
     length: Annotated[Length, plausible(TOOL_LENGTH)]
+    colours_from: str | None = None
 
 
 class HeadsetSettings(Settings):
@@ -241,9 +244,9 @@ def save_tone(path: Path, settings: CameraSettings, tone: torch.Tensor) -> None:
     _write(path, "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns; measured tone.", changed)
 
 
-def save_catheter(path: Path, catheter: Catheter) -> None:
-    """Write a catheter, for instance one whose edges were measured."""
-    settings = CatheterSettings(**{name: getattr(catheter, name) for name in CatheterSettings.model_fields})
+def save_catheter(path: Path, catheter: Catheter, colours_from: str | None = None) -> None:
+    """Write a catheter, for instance one whose edges were measured; see ``CatheterSettings`` on ``colours_from``."""
+    settings = CatheterSettings(**vars(catheter), colours_from=colours_from)
     _write(path, "A catheter: lengths in metres, edges of its bands from the tip, colours as 8-bit sRGB.", settings)
 
 

@@ -89,7 +89,7 @@ def calibrate_catheter(
         advice = "do X (to the right) and Y (downwards) lie on the bands? Photograph them in even light without gloss"
         raise ConfigError([f"{photograph}: {error}; found {listed}: {advice}"]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_catheter(out, catheter)
+    save_catheter(out, catheter, photograph.name)
     write_bytes(picture, encode_png(_places_shown(pixels, boxes, levels) / 255))
     lines = [
         f"Band {i}     [{', '.join(map(str, level))}] at {place}, median of {count} pixels, which deviate by "

@@ -22,7 +22,7 @@ from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.timing import timed
-from holotorch.experiments.tracking.config import FRAMES, SYNTHETIC, TrackSettings
+from holotorch.experiments.tracking.config import SYNTHETIC, TrackSettings
 from holotorch.experiments.tracking.devices import (
     build_headset,
     calibration_sd,
@@ -167,7 +167,7 @@ def _check_synthetic(settings: TrackSettings) -> None:
     camera, catheter = _files(settings)
     world = synthetic_world(camera, catheter)
     fitting_tracker(settings.method, world.camera, world.catheter, catheter and (find_config(catheter) or catheter))
-    synthetic_poses(world, settings.frames, synthetic_distance(world))
+    synthetic_poses(world, settings.rendered, synthetic_distance(world))
 
 
 def _open(settings: TrackSettings, source: str | Path) -> TrackingInputs:
@@ -185,9 +185,9 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     settings = experiment.settings
     if experiment.inputs is None:
         world = synthetic_world(*_files(settings))
-        (height, width), gigabytes = world.size, recording_bytes(world.size, settings.frames) / 1e9
+        (height, width), gigabytes = world.size, recording_bytes(world.size, settings.rendered) / 1e9
         size = f"{width} x {height} px, {gigabytes:.2f} GB"
-        text = f"Source     synthetic: {settings.frames} frames are rendered first, {size}"
+        text = f"Source     synthetic: {settings.rendered} frames are rendered first, {size}"
         return RunPlan(f"{text}\n{range_text(world.camera, world.catheter)}\n{distance_text(world)}")
     frames = experiment.inputs.frames
     height, width = frames.shape
@@ -201,7 +201,7 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
             "shutter reads a frame; `shutter: global` in the camera's file, or still=true for one at rest, leaves "
             "that out"
         )
-    if settings.frames != FRAMES:
+    if settings.frames is not None:
         lines.append(
             f"Note       frames={settings.frames} is for synthetic recordings; of this source, all are tracked"
         )
@@ -233,7 +233,7 @@ def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
     settings = experiment.settings
     camera, catheter = _files(settings)
     made = {"camera": camera, "catheter": catheter, "video": settings.video}
-    recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, **made)
+    recording = write_synthetic(folder.path / SYNTHETIC, settings.rendered, **made)
     inputs = _open(settings, recording)
     return _tracked(replace(experiment, inputs=inputs, truth=read_truth(recording)), inputs, folder)
 

@@ -71,8 +71,8 @@ def open_inputs(
             missing.append(f"no {name} is given: say which with --{name}{here}, or {name}: in a configuration")
     if missing:
         raise ConfigError(missing)
-    lens, tool = _loaded(paths)
-    model = devices.build_camera(lens)
+    lens, bands = _loaded(paths)
+    model, tool = devices.build_camera(lens), devices.build_catheter(bands)
     readout = 0.0 if still or lens.shutter == "global" else READOUT
     tracker = fitting_tracker(method, model, tool, paths["catheter.yaml"], readout)
     try:
@@ -84,9 +84,20 @@ def open_inputs(
     except ConfigError:
         frames.__exit__()
         raise
-    if doubt := ambiguity_text(ambiguities(model, tool)):
+    if not _same_colours(bands.colours_from, source, frames) and (doubt := ambiguity_text(ambiguities(model, tool))):
         frames.notes.append(doubt)
     return TrackingInputs(frames, model, tool, tracker, paths)
+
+
+def first_frame(video: Path) -> Path:
+    """Name of the picture of the first frame of a video, as ``calibrate catheter`` saves it."""
+    return Path(f"{video.stem}-frame.png")
+
+
+def _same_colours(colours_from: str | None, source: str | Path, frames: Frames) -> bool:
+    """Whether the bands' colours were read from these frames, so that exchanged channels are exchanged in both."""
+    path = Path(source)
+    return bool(colours_from) and colours_from in {path.name, str(first_frame(path)), frames.recorded_from}
 
 
 def _is_replay(source: str | Path) -> bool:
@@ -103,7 +114,7 @@ def _is_replay(source: str | Path) -> bool:
     return False
 
 
-def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, Catheter]:
+def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, devices.CatheterSettings]:
     """Load the camera and the catheter. ConfigError lists the mistakes of both files."""
     mistakes: list[str] = []
     loaded: list[Any] = []
@@ -114,7 +125,7 @@ def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, Catheter]:
             mistakes += error.mistakes
     if mistakes:
         raise ConfigError(mistakes)
-    return loaded[0], devices.build_catheter(loaded[1])
+    return loaded[0], loaded[1]
 
 
 def fitting_tracker(

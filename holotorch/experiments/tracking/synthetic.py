@@ -16,6 +16,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.folder import claim
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.tracking import devices
+from holotorch.experiments.tracking.config import SYNTHETIC
 from holotorch.experiments.tracking.forecast import HALF, working_range
 from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
@@ -160,9 +161,9 @@ def _render(folder: Path, poses: Sequence[tuple[Tensor, Tensor]], world: World, 
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
         copies = {name: Path(temporary, name) for name in ("camera.yaml", "catheter.yaml")}
         devices.save_camera(copies["camera.yaml"], world.camera, size, "global")
-        devices.save_catheter(copies["catheter.yaml"], tool)
+        devices.save_catheter(copies["catheter.yaml"], tool, SYNTHETIC)
         movie = replacing_video(folder / VIDEO, size, RATE) if video else nullcontext()
-        with Recorder(folder, size, RATE, "synthetic", copies) as recorder, movie as writer:
+        with Recorder(folder, size, RATE, SYNTHETIC, copies) as recorder, movie as writer:
             for i, (tip, along) in enumerate(tqdm(poses, desc="rendering", unit="frame")):
                 x, y = world.camera.project((tip + middle * along)[None])[0].tolist()
                 # A finger covers the middle of the bands in 10 of 45 frames.

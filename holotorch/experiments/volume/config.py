@@ -165,6 +165,9 @@ class VolumeReport(Settings):
     seeds: Annotated[Count, Field(le=256)] = 1
 
 
+Scale = Annotated[Count, Field(le=64)]
+
+
 class VolumeSettings(Settings):
     """The hologram of a volume, which is rendered directly into light sources, and its refocused pictures.
 
@@ -188,7 +191,7 @@ class VolumeSettings(Settings):
     hologram: HologramSettings
     wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)]
     phase: Literal["point", "ray", "smooth", "constant"] = "point"
-    scale: Annotated[Count, Field(le=64)] = 1
+    scale: Scale = 1
     report: VolumeReport = VolumeReport()
 
 

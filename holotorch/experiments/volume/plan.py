@@ -26,6 +26,7 @@ _PICTURE_SECONDS = 2.4e-6  # seconds to score a pixel of a picture, encode it an
 _BASE_BYTES = 410e6  # memory of the libraries
 _RAY_BYTES = 120  # memory of the renderer per ray
 _FEW_VALUES = 0.01  # share of the range of a volume below which points hardly lie among its values
+_FAINT = 0.02  # share of the voxels above the background from which a note says that a preset hides them
 _COARSE_SLABS = 0.1  # predicted error of a rendering above which the plan contains a note
 _DENSE, _STEEP = 0.5, 0.1  # opacity of a surface, and the part of the range of values within which it rises to that
 _SIDES = {"L": "left", "R": "right", "A": "front", "P": "back", "S": "head", "I": "feet"}  # of a patient
@@ -217,18 +218,18 @@ def preset_note(experiment: VolumeExperiment) -> str:
     low, high = experiment.preset_range
     transfer = experiment.transfer
     hidden = float(transfer.positions[max(0, int((transfer.opacities > 0).to(torch.uint8).argmax()) - 1)])
-    # The part of the histogram that is hidden lies between its threshold, low, and the first value that shows.
-    preset, shown = experiment.settings.transfer.preset, (low + hidden) / 2
-    lower = low - (hidden - shown) * (high - low) / (high - hidden)
+    preset, shown, values = experiment.settings.transfer.preset, experiment.background, experiment.counted
     note = (
         f"the preset {preset} lies between {low:.3g} and {high:.3g}, from the histogram, and shows nothing of values "
         f"below {hidden:.3g}: look at it with holotorch check --preview"
     )
-    if lower >= low:
+    if shown is None or (faint := 1 - (values >= hidden).sum() / (values > shown).sum()) < _FAINT:
         return note
+    lower = low - (hidden - shown) * (high - low) / (high - hidden)  # the preset begins a fixed share above its low
+    kind = " (in a patient, soft tissue)" if preset == "bone" else ""
     return (
-        f"{note}; it begins above its low, so that values from {shown:.3g} on, for example, are shown by "
-        f"'transfer={{preset: {preset}, low: {lower:.3g}, high: {high:.3g}}}'"
+        f"{note}; that hides {100 * faint:.2g} % of the voxels above {shown:.4g}, where the background ends{kind}; "
+        f"'transfer={{preset: {preset}, low: {lower:.4g}, high: {high:.4g}}}' shows them"
     )
 
 

@@ -15,30 +15,31 @@ from holotorch.experiments.volume.experiment import VolumeExperiment
 
 _SIDE = 256  # largest number of pixels of the rendering along each side
 _SMALL = 96  # that of the renderings from other sides
-_SAMPLE = 1_000_000  # largest number of voxels in the histogram
 _SHARES = (1, 25, 50, 75, 90, 95, 99, 99.9)  # percentiles that are listed
 
 
 def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
     """PNG of rendering and histogram, and lines with the percentiles of the values and the visible share."""
-    values = experiment.volume.values.detach().flatten()
-    every = max(1, len(values) // _SAMPLE)
-    values = values[::every].double().cpu()
-    lowest, chosen, of = values.min(), values, ""
-    if 0.5 < (share := (values == lowest).double().mean().item()) < 1:  # air, which would hide all that is in it
-        chosen, of = values[values > lowest], f" (of the {100 * (1 - share):.2g} % of voxels above the smallest value)"
-    levels = np.percentile(chosen.numpy(), _SHARES)
+    values, air = experiment.counted, experiment.background
+    every = experiment.volume.values.numel() // len(values)
+    border = "the smallest value" if air is None else f"{air:.4g}, where the background ends"
+    above, of = values[values > (values.min() if air is None else air)], ""
+    if air is not None or 0 < len(above) < len(values) / 2:  # without the air, which would hide all that is in it
+        of = f" (of the {100 * len(above) / len(values):.2g} % of voxels above {border})"
+    chosen = above if of else values
+    levels = np.percentile(chosen, _SHARES)
     with torch.no_grad():
-        visible = (experiment.transfer(values.to(experiment.device))[1] > 0).double().mean().item()
+        visible = (experiment.transfer(torch.from_numpy(values).to(experiment.device))[1] > 0).double().mean().item()
         picture = experiment.quick_rendering(_SIDE)
     bright = picture.amax().item()
+    of += f", of one voxel in {every}" * (every > 1)
     lines = [
-        f"Values     {lowest:.6g} to {values.max():.6g}; percentiles{of}{f', of one voxel in {every}' * (every > 1)}: "
+        f"Values     {values.min():.6g} to {values.max():.6g}; percentiles{of}: "
         + ", ".join(f"{level:.6g} at {share:g} %" for share, level in zip(_SHARES, levels, strict=True)),
         f"Visible    {100 * visible:.2g} % of the voxels have an opacity above 0"
         + ("" if bright > 0.02 else "; the rendering is black: move the transfer function to the values of the volume"),
     ]
-    return _drawn(experiment, values.numpy(), picture), "\n".join(lines)
+    return _drawn(experiment, values, picture), "\n".join(lines)
 
 
 def _standing(experiment: VolumeExperiment) -> dict[str, torch.Tensor]:

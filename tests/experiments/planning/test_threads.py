@@ -12,6 +12,7 @@ from holotorch.experiments.planning import threads
 from holotorch.experiments.planning.threads import undisturbed
 from holotorch.experiments.sweep.one import carry_out
 
+SHARE = threads._share  # the real one
 TINY = ("volume={phantom: shells, samples: 16}", "scale=16", "transfer=bone")
 
 
@@ -26,6 +27,7 @@ def four(monkeypatch):
         return times[count]
 
     monkeypatch.setattr(threads, "_mean_seconds", timed)
+    monkeypatch.setattr(threads, "_share", lambda: 1.0)
     monkeypatch.setattr(threads.os, "cpu_count", lambda: 4)
     before = torch.get_num_threads()
     torch.set_num_threads(4)
@@ -49,6 +51,16 @@ def test_fewer_threads_where_others_hold_processors(seconds, count, four, capsys
     four.update(zip((4, 3, 2, 1), seconds, strict=True))
     assert used() == count
     assert f"{count}, not 4: other programs use the processors" in capsys.readouterr().out
+
+
+def test_a_busy_processor_is_announced(four, monkeypatch, capsys):
+    clock = iter(range(100))  # each look at the clock is a second later, in which the thread works for 0.4 s
+    monkeypatch.setattr(threads, "_share", SHARE)
+    monkeypatch.setattr(threads.time, "perf_counter", lambda: float(next(clock)))
+    worked = iter((0.0, 0.4))
+    monkeypatch.setattr(threads.time, "thread_time", lambda: next(worked))
+    assert used() == 4
+    assert "this takes about 2.5 times the predicted seconds" in capsys.readouterr().out
 
 
 def test_a_number_that_is_asked_for_is_followed(four, monkeypatch):

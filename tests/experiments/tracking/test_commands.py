@@ -159,7 +159,7 @@ def test_track_hands_its_arguments_on(monkeypatch):
         "source": "0",
         "camera": "c.yaml",
         "catheter": "t.yaml",
-        "frames": 45,
+        "frames": None,
         "headset": "h.yaml",
     }
     assert taken[0] == values | flags

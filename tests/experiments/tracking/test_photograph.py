@@ -50,6 +50,29 @@ def test_a_catheter_whose_colours_come_from_a_photograph_is_tracked(capsys):
     assert not CatheterTracker(world.camera, ordinary, channels=ChannelOrder.RGB)(frame)[0].answered
 
 
+def test_the_order_of_channels_is_no_doubt_where_the_colours_come_from_the_same_frames(capsys):
+    world = World(size=SIZE)  # red, green and blue: the same from the other end if red and blue are exchanged
+    places = [f"{x},{y}" for x, y in photograph(world)]
+    save_camera(Path("camera.yaml"), world.camera, SIZE)
+    Path("film").mkdir()
+    for name in ("film/0.png", "film-frame.png"):
+        Path(name).write_bytes(Path("bands.png").read_bytes())
+    doubt = "frames in the order BGR show this catheter in another pose"
+    for source, doubtful in (("film", False), ("film-frame.png", False), ("bands.png", True)):
+        own = f"{source}.yaml"
+        assert main(["calibrate", "catheter", source, "--bands", *places, "--out", own]) == 0
+        assert doubt in capsys.readouterr().out  # said once, of all frames that may be tracked with this file
+        words = ["configs/tracking/track.yaml", "source=film", "camera=camera.yaml", "video=false"]
+        assert main(["check", *words, f"catheter={own}"]) == 0
+        assert (doubt in capsys.readouterr().out) is doubtful
+    assert main(["check", *words, "catheter=configs/tracking/catheter.yaml"]) == 0
+    assert doubt in capsys.readouterr().out
+    # A recording keeps the name of its source, and the catheter's file beside it that of its colours.
+    assert main(["run", *words, "catheter=film.yaml", "record=true", "--out", "run"]) == 0
+    capsys.readouterr()
+    assert main(["check", words[0], "source=run/recording"]) == 0 and doubt not in capsys.readouterr().out
+
+
 def test_a_box_counts_its_median_and_keeps_the_geometry_of_a_file(capsys):
     picture = np.full((60, 90, 3), 128, np.uint8)
     for i, colour in enumerate(((200, 30, 40), (40, 180, 60), (50, 60, 255))):  # the third is overexposed

@@ -6,10 +6,13 @@ import re
 import numpy as np
 import pytest
 import torch
+import yaml
 from tiny_runs import EYE, VOLUME
 
 from holotorch.cli import main
+from holotorch.experiments.eye.run import scene_settings
 from holotorch.experiments.registry import find_kind, load_config
+from holotorch.experiments.volume.config import ViewSettings
 from holotorch.io.images import load_image
 
 TINY = ["configs/volume/tooth.yaml", VOLUME[2], "device=cpu"]
@@ -37,14 +40,60 @@ def test_a_preset_without_values_lies_between_air_and_the_brightest(scan, capsys
     assert main(["check", *words]) == 0
     said = capsys.readouterr().out
     assert "the preset bone lies between" in said
-    (proposed,) = re.findall(r"shown by '(transfer=.*?)'", said)
-    assert main(["check", *words[:-1], proposed]) == 0 and "the preset bone lies" not in capsys.readouterr().out
     assert main(["check", *words[:-1], "transfer={preset: bone, low: 3}"]) == 2
     assert "expected both low and high, or neither" in capsys.readouterr().err
     assert main(["check", *words[:-1], "transfer=bone", "transfer.low=30", "transfer.high=180"]) == 0
     assert "lies between" not in capsys.readouterr().out
     assert main(["check", *words[:-1], "transfer.preset=bone"]) == 2  # beside the points of the file
     assert "expected one of preset, file or points, got preset and points; 'transfer=" in capsys.readouterr().err
+
+
+def plant(path, faint=0.15, noise=0.0):
+    """A trunk of value 200 with a branch of value 60 in air of 0, as a volume of its own; noise is Gaussian."""
+    values = np.zeros((20, 20, 20))
+    values[8:12, 8:12, :], values[9:11, :, 9:11] = 200, np.where(np.arange(20) < 20 * faint, 60, 0)[:, None]
+    values[8:12, 8:12, :] += np.arange(20) % 3  # so that there are more values than parts
+    np.save(path, (values + noise * np.random.default_rng(5).standard_normal(values.shape)).astype(np.float32))
+    return f"volume={{path: {path}, spacing: 1, unit: relative}}"
+
+
+def build(*words):
+    return find_kind("volume").build(load_config(TINY[0], [*TINY[1:], *words]))
+
+
+def test_a_note_on_a_preset_proposes_a_range_that_shows_what_it_hides(tmp_path, capsys):
+    words = [plant(tmp_path / "plant.npy", faint=1, noise=2.0), "transfer=soft_tissue"]
+    experiment = build(*words)
+    assert experiment.background is not None and 6 < experiment.background < 60  # 3 deviations of the noise
+    assert main(["check", *TINY, *words]) == 0
+    said = capsys.readouterr().out
+    (proposed,) = re.findall(r"'(transfer=.*?)' shows them", said)
+    assert "where the background ends; " in said
+    air, branch = torch.tensor([6.0]), torch.tensor([60.0])
+    shown = build(words[0], proposed).transfer
+    assert experiment.transfer(branch)[1] == 0 < shown(branch)[1] and shown(air)[1] == 0
+    assert main(["check", *TINY, words[0], proposed]) == 0 and "where the background" not in capsys.readouterr().out
+    assert main(["check", *TINY, words[0], "transfer=bone"]) == 0  # which is to hide what is soft
+    assert "where the background ends (in a patient, soft tissue)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("noise", [0.5, 5.0, 20.0])
+def test_noise_alone_is_no_faint_tissue(tmp_path, capsys, noise):
+    words = [plant(tmp_path / "plant.npy", faint=0, noise=noise), "transfer=soft_tissue"]
+    air = build(*words).background
+    assert air is None or 4 * noise < air < 200 - 4 * noise  # above the noise, below what is there
+    assert main(["check", *TINY, *words]) == 0
+    assert "the preset soft_tissue lies" in (said := capsys.readouterr().out) and "shows them" not in said
+
+
+@pytest.mark.parametrize("values", [(0, 100), (7, 7.5)])
+def test_a_volume_of_two_values_has_no_background_of_three_parts(tmp_path, capsys, values):
+    one, other = values
+    np.save(tmp_path / "two.npy", np.where(np.arange(8000).reshape(20, 20, 20) < 400, other, one).astype(np.float32))
+    words = [f"volume={{path: {tmp_path / 'two.npy'}, spacing: 1, unit: relative}}", "transfer=soft_tissue"]
+    assert build(*words).background is None
+    assert main(["check", *TINY, *words, "view={width: 0.1 mm}", "--preview", str(tmp_path / "look.png")]) == 0
+    assert "percentiles (of the 5 % of voxels above the smallest value): " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -73,7 +122,9 @@ def test_a_preview_shows_the_volume_and_its_values(scan, tmp_path, capsys):
     assert main(["check", *words, "--preview", str(picture)]) == 0
     out = capsys.readouterr().out
     # 904 of 8000 voxels lie in the ball.
-    assert "Values     20 to 255; percentiles: 20 at 1 %, 20 at 25 %" in out
+    assert (
+        "Values     20 to 255; percentiles (of the 11 % of voxels above 22.29, where the background ends): 200" in out
+    )
     assert "202 at 99 %" in out and "Visible    11 %" in out
     pixels = load_image(picture).movedim(0, -1).numpy() * 255
     left = pixels[:, : pixels.shape[1] // 3]
@@ -140,6 +191,24 @@ def test_an_eye_sees_an_own_volume_by_the_same_keys(scan, tmp_path, capsys):
     assert "expected a path, a scene or a phantom" in capsys.readouterr().err
 
 
+def test_an_eye_takes_view_and_scale_by_the_keys_of_a_volume(tmp_path):
+    change = EYE[0].removeprefix("scene=")
+    words = [f"scene={change}", *EYE[1:], "seeds=1", "light={sources: [laser]}", "focus=[1 mm]", "tolerance=0.1"]
+    path = "configs/eye/teapot.yaml"
+    scene = scene_settings(load_config(path, words))
+    given = ["view.lighting=true", "view.azimuth_deg=20", "scale=2"]
+    changed = scene_settings(settings := load_config(path, [*words, *given]))
+    view = scene.view.model_copy(update={"lighting": True, "azimuth_deg": 20.0})
+    assert changed == scene.model_copy(update={"view": view, "scale": 2})
+    assert scene.view != ViewSettings()  # so that another key of its view is kept
+    (tmp_path / "saved.yaml").write_text(yaml.safe_dump(settings.model_dump(mode="json")))
+    assert scene_settings(load_config(tmp_path / "saved.yaml")) == changed
+    assert (
+        "; view.azimuth_deg=20.0, view.lighting=true, scale=2"
+        in (kind := find_kind("eye")).plan(kind.build(settings)).text
+    )
+
+
 def test_the_percentiles_of_a_scan_that_is_mostly_empty_are_those_of_what_is_in_it(tmp_path, capsys):
     values = np.zeros((20, 20, 20), np.uint8)
     values[8:12, 8:12, 8:12] = 100 + np.arange(64).reshape(4, 4, 4)  # 0.8 % of all
@@ -148,10 +217,10 @@ def test_the_percentiles_of_a_scan_that_is_mostly_empty_are_those_of_what_is_in_
     words = [*TINY, f"volume={scan}", "transfer={preset: vessels}", "view={width: 0.1 mm}"]
     assert main(["check", *words, "--preview", str(tmp_path / "look.png")]) == 0
     out = capsys.readouterr().out
-    assert (
-        "Values     0 to 163; percentiles (of the 0.8 % of voxels above the smallest value): 100.63" in out
-        and "131.5 at 50 %" in out
+    found = re.search(
+        r"0 to 163; percentiles \(of the 0.8 % of voxels above (.*), where the background ends\): 100.63", out
     )
+    assert found and 0 <= float(found[1]) < 100 and "131.5 at 50 %" in out
 
 
 def test_a_picture_refocused_beside_the_scene_is_announced_with_the_scale(capsys):
