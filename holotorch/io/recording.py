@@ -168,7 +168,8 @@ def open_recording(folder: Path) -> Frames:
                     pixels = np.frombuffer(data, np.uint8).reshape(*shape, 3)
                     yield Frame(seconds, torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
 
-    return Frames(folder.name, shape, len(complete), header["rate_hz"], frames(), notes, recorded_from=str(header.get("source", "")))
+    made_from = str(header.get("source", ""))
+    return Frames(folder.name, shape, len(complete), header["rate_hz"], frames(), notes, recorded_from=made_from)
 
 
 def free_bytes(folder: Path) -> int:
