@@ -28,7 +28,7 @@ for address in [given for given in sys.argv[1:] if given.startswith("http")]:
     except urllib.error.HTTPError:
         pass
     except OSError as error:
-        sys.exit(f"PIP_EXTRA_INDEX_URL {address} does not answer ({error}); installing without it")
+        sys.exit(f"PIP_EXTRA_INDEX_URL {address} does not answer ({error}); installing without it, which may fetch a larger torch")
 END
 }
 

@@ -92,9 +92,9 @@ def in_words(values: dict[str, Any]) -> list[str]:
         f"Eye box    {_span(values['eye_box_mm'])} mm wide; {entering} % of the light from the scene's edge enters the "
         f"pupil; the scene appears {near} to {far} mm from the eye"
         + (f" ({dioptres} dioptres; {_AGES})" if dioptres else ""),
-        f"Regions    centre {_list(values['region_of_centre'])}, edge {_list(values['region_of_edge'])} ({meanings}); "
-        f"the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near "
-        f"end, {spots[1]} um at the far end",
+        f"Regions    by colour: centre {_list(values['region_of_centre'])}, edge {_list(values['region_of_edge'])} "
+        f"({meanings}); the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um "
+        f"at the near end, {spots[1]} um at the far end",
     ]
     return [*lines, *(f"WARNING    {warning}" for warning in warnings(values))]
 

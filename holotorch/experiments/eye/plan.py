@@ -116,7 +116,7 @@ def _shallow(eye: Observer) -> list[str]:
 
 
 def _scene(eye: Observer) -> str:
-    """The volume in words: that of the configuration with the view of the scene, or the volume of the scene."""
+    """Where volume, view and hologram come from, in words."""
     scene, own = eye.settings.scene.config, eye.settings.volume
     source = scene if own is None else f"{own.path or own.scene or own.phantom}, with view and hologram of {scene}"
     if changes := eye.settings.scene.change:
@@ -126,20 +126,22 @@ def _scene(eye: Observer) -> str:
     words += [] if (scale := eye.settings.scale) is None else [f"scale={scale}"]
     if words:
         source += f"; {', '.join(words)}"
-    return "; ".join(filter(None, (source, volume_plan.preset_note(eye.scene))))
+    return source
 
 
 def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     """The plan in words."""
-    settings, depths = eye.settings, values["focus_mm"]
+    settings, depths, grid = eye.settings, values["focus_mm"], eye.scene.grid
     lines = [
         f"Scene      {values['scene']}" + (f" (synthetic: {values['synthetic']})" if values["synthetic"] else ""),
         f"View       {volume_plan.viewpoint(eye.scene)}",
+        f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um, {eye.scene.rays.shape[0]} x "
+        f"{eye.scene.rays.shape[1]} rays, {len(eye.scene.depths)} planes",
         f"Display    {settings.display.kind}; eyepiece {values['display']['lens_distance_mm']:.4g} mm from the "
         f"hologram, eye {values['display']['eye_distance_mm']:.4g} mm behind it",
         f"Focus      at {', '.join(f'{depth:.4g}' for depth in depths)} mm, which appear at "
-        f"{', '.join(f'{distance:.4g}' for distance in values['accommodation_mm'])} mm; sine of the half angle "
-        f"{', '.join(f'{sine:.3g}' for sine in values['aperture'])}",
+        f"{', '.join(f'{distance:.4g}' for distance in values['accommodation_mm'])} mm; the pupil takes light "
+        f"of a half angle whose sine is {', '.join(f'{sine:.3g}' for sine in values['aperture'])}",
         *eye_geometry.in_words(values["geometry"]),
     ]
     for method in dict.fromkeys(choice["method"] for choice in values["retina"]):
@@ -151,6 +153,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     lines.append(f"Methods    to the retina, by {_METHODS}")
     lines += _cheaper(eye, values["retina"])
     lines += colours_in_words("volume", eye.scene.settings.wavelengths)
+    each = "by colour, " if len(eye.scene.settings.wavelengths) > 1 else ""
     light = "; ".join(
         f"{name}: {plain(values['followed'][name])} of {plain(count)} wavelengths simulated"
         for name, count in values["wavelengths"].items()
@@ -161,7 +164,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         y, x = (1e3 * each for each in settings.eye.position)
         lines.append(f"Eye        beside the axis, at y {y:.3g} mm, x {x:.3g} mm; light below: for an eye on the axis")
     lines += [
-        f"Light      {light}{others}{directions}",
+        f"Light      {each}{light}{others}{directions}",
         f"Phases     {settings.seeds} realisation(s) of the random phases, compared with the mean of "
         f"{8 * settings.seeds} others",
         eye.budget.text,
@@ -177,6 +180,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     if settings.tradeoff:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  in addition, at {where} mm, by the method collapse; the cost above excludes it")
+    lines += [f"Note       {note}" for note in filter(None, (volume_plan.preset_note(eye.scene),))]
     first = len(eye_geometry.warnings(values["geometry"]))  # printed above, with the numbers of the geometry
     return "\n".join([*lines, *(f"WARNING    {warning}" for warning in values["warnings"][first:])])
 

@@ -229,7 +229,8 @@ def preset_note(experiment: VolumeExperiment) -> str:
     kind = " (in a patient, soft tissue)" if preset == "bone" else ""
     return (
         f"{note}; that hides {100 * faint:.2g} % of the voxels above {shown:.4g}, where the background ends{kind}; "
-        f"'transfer={{preset: {preset}, low: {lower:.4g}, high: {high:.4g}}}' shows them"
+        f"'transfer={{preset: {preset}, low: {lower:.4g}, high: {high:.4g}}}' "
+        "shows them, as the preset begins above its low"
     )
 
 
