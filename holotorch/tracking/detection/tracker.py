@@ -546,7 +546,7 @@ class CatheterTracker(nn.Module):
             others = np.where(np.arange(len(edges.t)) == index, np.nan, edges.t)
             if self._crossed(sampler, axis, others, float(edges.t[index])):
                 crossed.append(index)
-        text = f"edges disagree with any pose: chi-square {line_pose.chi_square:.1f}, {freedom} degree(s) of freedom"
+        text = f"edges disagree with any pose: chi-square {line_pose.chi_square:.1f} of {freedom}"
         raise Refusal(Status.INCONSISTENT, text, final=True, crossed=tuple(crossed))
 
     def _expected_edges(self, line_pose: LinePose, line: Line) -> np.ndarray:
