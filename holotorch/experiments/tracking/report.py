@@ -186,7 +186,10 @@ _ADVICE = {
 
 
 _THIS_CAMERA = "are `edges` counted from the tip, and is the camera's file that of this camera, at this focus?"
-_SINGLE = "the files fit the other frames: is something across or beside a band there, or a highlight on it?"
+_SINGLE = (
+    "the files fit the other frames: is something across or beside a band there, a highlight on it, or are its colours "
+    "coarse, as in compressed video?"
+)
 
 
 def verdict(summary: dict[str, Any]) -> str:
