@@ -85,6 +85,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
     regions = sorted({*values["region_of_centre"], *values["region_of_edge"]})
     meanings = "; ".join(f"{_ROMAN[number]}: {_REGIONS[number]}" for number in regions)
     meanings += "; this cone is as wide as the pixels can bend light"
+    colours = " / ".join(f"{wavelength:.0f}" for wavelength in values["wavelengths_nm"])
     spots = [_span(row) for row in values["smallest_spot_um"]]
     entering = _span([100 * share for share in values["light_of_edge"]])
     lines = [
@@ -92,9 +93,9 @@ def in_words(values: dict[str, Any]) -> list[str]:
         f"Eye box    {_span(values['eye_box_mm'])} mm wide; {entering} % of the light from the scene's edge enters the "
         f"pupil; the scene appears {near} to {far} mm from the eye"
         + (f" ({dioptres} dioptres; {_AGES})" if dioptres else ""),
-        f"Regions    by colour: centre {_list(values['region_of_centre'])}, edge {_list(values['region_of_edge'])} "
-        f"({meanings}); the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um "
-        f"at the near end, {spots[1]} um at the far end",
+        f"Regions    by colour ({colours} nm): centre {_list(values['region_of_centre'])}, edge "
+        f"{_list(values['region_of_edge'])} ({meanings}); the whole scene is in region III from "
+        f"{values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near end, {spots[1]} um at the far end",
     ]
     return [*lines, *(f"WARNING    {warning}" for warning in warnings(values))]
 

@@ -121,7 +121,10 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
             f"{physics['resolved_mm']:.3g} mm{blurred}{'' if experiment.isolated else periodic}"
         )
     if planned := values.get("single_propagation"):
-        lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
+        lines.append(
+            f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}"
+            "; the run itself takes the propagator named above"
+        )
     if region := settings.target.region:
         lines.append(
             f"Region     the middle {region[0]} x {region[1]} px hold the picture; other pixels are not constrained"

@@ -67,9 +67,11 @@ def error_line(summary: dict[str, Any]) -> list[str]:
         return []
     predicted, measured = summary["predicted_error"], summary["measured_error"]
     words = "not measured" if measured is None else f"{100 * measured:.2g} % measured"
-    return [
-        f"Error      of the calculation itself: {words}, {100 * predicted:.2g} % predicted; the report names its parts"
-    ]
+    parts = summary.get("errors", ())
+    compared = sum(part["measured"] is not None for part in parts)
+    words += f", {100 * predicted:.2g} % predicted"
+    words += f" in {compared} of its {len(parts)} parts" if 0 < compared < len(parts) else ""
+    return [f"Error      of the calculation itself: {words}; the report names its parts"]
 
 
 def error_sentence(summary: dict[str, Any]) -> str:

@@ -57,8 +57,9 @@ def cut_off_note(kernel: Tensor) -> list[str]:
     beyond = heat_beyond(kernel)
     about = f", some {beyond:.1%} of that within," if beyond > _MISSING else ""
     return [
-        f"the measured kernel is cut off where the rise is still {warm_ring(kernel):.1%} of that of its centre: "
-        f"the heat beyond{about} is not in the model; give more rows and columns, or subtract what is not heat"
+        f"the measured kernel is cut off where the rise is still {warm_ring(kernel):.1%} of that of its centre "
+        f"(mean of the warmest side): the heat beyond{about} is not in the model; give more rows and columns, or "
+        "subtract what is not heat"
     ]
 
 

@@ -43,13 +43,12 @@ def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
 
 
 def _standing(experiment: VolumeExperiment) -> dict[str, torch.Tensor]:
-    """Renderings of an own scan by ``view.up``, without its lighting; none if its file names the sides of a patient."""
-    settings = experiment.settings
-    if not settings.volume.path or experiment.volume.frame not in ("", "xyz"):
-        return {}
-    pictures = {}
+    """Renderings of an own scan by ``view.up``, without its lighting; ``head`` if the file names a patient's sides."""
+    settings, pictures = experiment.settings, dict[str, torch.Tensor]()
+    if not settings.volume.path:
+        return pictures
     for up in get_args(ViewSettings.model_fields["up"].annotation):
-        if up != "head":
+        if up != "head" or experiment.volume.frame not in ("", "xyz"):
             view = settings.view.model_copy(update={"up": up, "samples": experiment.samples})
             turned = replace(experiment, settings=settings.model_copy(update={"view": view}))
             pictures[up] = turned.quick_rendering(_SMALL, lit=False)

@@ -148,7 +148,7 @@ def _write(opened: RunFolder, experiment: VolumeExperiment, state: _State, error
     captions = [caption + (", synthetic" if experiment.synthetic else "") for caption in captions]
     files.write(write_bytes, out / "images" / "comparison.png", figures.comparison([*images.values()], captions))
     depth_mm = torch.where(evaluation.visible, evaluation.depth * 1e3, torch.nan)[None]
-    label = "mean depth behind the hologram (mm)"
+    label = "mean distance from the hologram (mm)"
     depth_map = figures.channel_maps(depth_mm, ["depth of each ray"], label, "viridis")
     files.write(write_bytes, out / "images" / "depth.png", depth_map)
     seconds = ("seconds", "rendering_seconds", "refocus_seconds")

@@ -12,6 +12,7 @@ from tiny_runs import EYE, VOLUME
 from holotorch.cli import main
 from holotorch.experiments.eye.run import scene_settings
 from holotorch.experiments.registry import find_kind, load_config
+from holotorch.experiments.volume import preview as figure_preview
 from holotorch.experiments.volume.config import ViewSettings
 from holotorch.io.images import load_image
 
@@ -160,17 +161,19 @@ def test_a_preview_shows_which_direction_of_a_scan_may_point_up(tmp_path):
     assert all(0.8 < leads[order.index(up)] < 1.25 for up in ("-y", "y"))  # a bar along the axis of sight
 
 
-def test_the_preview_of_a_patient_has_no_other_directions(tmp_path):
+def test_the_preview_of_a_patient_also_shows_him_upright(tmp_path, monkeypatch):
     values = (np.arange(8000).reshape(20, 20, 20) % 251).astype(np.uint8)
-    heights = []
+    shown, real = [], figure_preview._show
+    monkeypatch.setattr(figure_preview, "_show", lambda *words: (shown.append(words[-1]), real(*words)))
     for name, frame in (("patient", "space: left-posterior-superior\n"), ("thing", "")):
         directions = "space directions: (1,0,0) (0,1,0) (0,0,1)\n" if frame else "spacings: 1 1 1\n"
         header = f"NRRD0004\ntype: uint8\ndimension: 3\n{frame}sizes: 20 20 20\n{directions}encoding: raw\n\n"
         (tmp_path / f"{name}.nrrd").write_bytes(header.encode() + values.tobytes())
         words = [*TINY, f"volume={{path: {tmp_path / name}.nrrd}}", "transfer={preset: bone}", "view={width: 0.1 mm}"]
         assert main(["check", *words, "--preview", str(tmp_path / f"{name}.png")]) == 0
-        heights.append(load_image(tmp_path / f"{name}.png").shape[-2])
-    assert heights[0] < 0.8 * heights[1]
+        directions = [title.removeprefix("view.up=").removesuffix(" (above)") for title in shown[1:]]
+        assert directions == ["-y", "y", "z", "-z", "x", "-x"] + ["head"] * (name == "patient")
+        shown.clear()
 
 
 def test_an_eye_sees_an_own_volume_by_the_same_keys(scan, tmp_path, capsys):

@@ -72,7 +72,7 @@ def test_the_map_of_depths_says_what_it_is_of(tmp_path, monkeypatch, tiny):
     labels = []
     monkeypatch.setattr(figures, "channel_maps", lambda values, names, label, colours: labels.append(label) or b"")
     execute(settings(), tmp_path / "a", "a")
-    assert labels == ["mean depth behind the hologram (mm)"]
+    assert labels == ["mean distance from the hologram (mm)"]
 
 
 @pytest.mark.usefixtures("undrawn")
