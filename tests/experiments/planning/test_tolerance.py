@@ -7,7 +7,7 @@ import pytest
 from tiny_runs import VOLUME, command
 
 from holotorch.cli import main
-from holotorch.experiments.planning.errors import Comparison, error_sentence, error_values, not_measured
+from holotorch.experiments.planning.errors import Comparison, error_line, error_sentence, error_values, not_measured
 from holotorch.experiments.planning.tolerance import Budget, Part
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -51,6 +51,9 @@ def test_errors_in_a_summary_and_in_words():
     sentence = error_sentence(values)
     assert "hologram 3.0e-03 predicted, 4.0e-03 measured" in sentence and "reference would take 90 s" in sentence
     assert error_values(parts[1:])["measured_error"] is None and error_sentence({}) == ""
+    (partly,), (whole,) = error_line(values), error_line(error_values(parts[:1]))
+    assert f"predicted in 1 of its {len(parts)} parts; the report names its parts" in partly
+    assert "predicted; the report names its parts" in whole
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-2, 1e-4])
