@@ -292,6 +292,7 @@ async def _send(
                     show(f"Slicer     {server.future} sent as refusals: captured in the future")
             for link in links:
                 text = f", {link.errors} failed: {link.last_error}" if link.errors else ""
+                text += "; it may have ended before the stream" if link.errors and link.sent else ""
                 show(f"Receiver   {link.host}:{link.port}: {link.sent} sent, {link.dropped} dropped for newer{text}")
 
 
