@@ -67,6 +67,15 @@ class TransferFunction(nn.Module):
         self.colours = nn.Parameter(colour, requires_grad=False)
         self.opacities = nn.Parameter(opacity, requires_grad=False)
 
+    @property
+    def visible_from(self) -> float:
+        """Largest value below which all values are transparent; -inf if there is none, inf if nothing is visible."""
+        visible = self.opacities.gt(0).nonzero()
+        if not len(visible):
+            return math.inf
+        first = int(visible[0])
+        return float(self.positions[first - 1]) if first else -math.inf
+
     def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Colour [C, ...] of C = 3 or more channels, and opacity [...] per unit distance, for ``values`` [...].
 

@@ -115,3 +115,20 @@ def test_mistakes_are_named(change, message):
         )
     with pytest.raises(TypeError, match="colours must be numbers"):
         TransferFunction(POSITIONS, "red", OPACITIES, unit_distance=0.01)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("opacities", "begin"),
+    [
+        (OPACITIES, 0.0),
+        ([0.0, 0.0, 0.0, 0.0, 0.5], 25.0),
+        ([0.1, 0.0, 0.0, 0.0, 0.0], -math.inf),
+        ([0.0] * 5, math.inf),
+    ],
+)
+def test_nothing_is_visible_below_the_value_that_is_said(opacities, begin):
+    transfer = table(opacities=opacities)
+    assert transfer.visible_from == begin
+    values = torch.linspace(-20, 110, 1301, dtype=torch.float64)
+    assert not transfer(values[values <= begin])[1].any()
+    assert not math.isfinite(begin) or transfer(torch.tensor(begin + 1e-6, dtype=torch.float64))[1] > 0

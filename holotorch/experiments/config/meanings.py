@@ -53,6 +53,7 @@ MEANINGS = {
     "VolumeSource.left_handed": "show the mirror image, for a file that does not say how its axes lie",
     "TransferSettings.preset": "colours and opacities by name, between low and high",
     "TransferSettings.low": "value of air or of tissue around, where a preset begins; opacity follows within a third",
+    "TransferSettings.visible_from": "value from which on something is visible, in place of low",
     "TransferSettings.high": "value of the volume at which a preset ends",
     "TransferSettings.file": "JSON file of a transfer function, as ParaView exports it",
     "TransferSettings.points": "[value, red, green, blue, opacity] each, values of the volume rising",

@@ -5,6 +5,7 @@ from typing import Any
 
 from holotorch.experiments.runs.page import element, figure, heading, table
 from holotorch.experiments.runs.record import RunRecord
+from holotorch.experiments.tracking.report import MOVED
 
 _GRID = [
     ("acc_mm", "Acc: mean error of the distances to the reference (mm)"),
@@ -157,7 +158,10 @@ def verdict(summary: Mapping[str, Any]) -> str:
             sentences.append(
                 f"{name} {_number(value)} {key.rsplit('_')[-1]}" + (f" (dissertation {beside})" if beside else "")
             )
-    return f"{protocol:10} " + "; ".join(sentences[:4])
+    moved = any(str(note).startswith(MOVED) for note in summary.get("notes", ()))
+    return (
+        f"{protocol:10} " + "; ".join(sentences[:4]) + "; a catheter that moves has no stability: see the Note" * moved
+    )
 
 
 def _number(value: Any) -> str:

@@ -123,7 +123,7 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     if planned := values.get("single_propagation"):
         lines.append(
             f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}"
-            "; the run itself takes the propagator named above"
+            "; in your own code, plan_propagation takes it: the run itself takes the propagator named above"
         )
     if region := settings.target.region:
         lines.append(

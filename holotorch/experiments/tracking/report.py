@@ -35,6 +35,7 @@ COLUMNS = (
 _STATED = "the uncertainty from the frames alone, without that of the calibration of the camera and of the band edges"
 _MOVED = 3.0  # largest spread of the tips of a resting catheter, as a multiple of the tracker's standard deviation
 _MANY = 5  # ratio of answered to refused frames above which the files of camera and catheter are hardly the cause
+MOVED = "was the catheter at rest?"  # how the note on a larger spread begins
 _SHOWN = 4  # number of kinds of refusals that are counted with their first frame
 
 
@@ -159,7 +160,7 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
             allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
             if stability.sd > _MOVED * allowed:
                 notes.append(
-                    f"was the catheter at rest? The tips spread by {1e3 * stability.sd:.3f} mm about their mean, more "
+                    f"{MOVED} The tips spread by {1e3 * stability.sd:.3f} mm about their mean, more "
                     f"than {_MOVED:g} times their stated deviation of {1e3 * allowed:.3f} mm (root mean squares); "
                     "S_RMS of a moving catheter says nothing of stability"
                 )

@@ -73,7 +73,8 @@ class TransferSettings(Settings):
     """Colour and opacity: a preset between the values ``low`` and ``high`` of the volume, a JSON file, or ``points``.
 
     Without ``low`` and ``high``, a preset lies between Otsu's threshold, which divides the histogram into a dark and a
-    bright part, and the value that 0.1 % of the voxels exceed.
+    bright part, and the value that 0.1 % of the voxels exceed. ``visible_from`` takes the place of ``low``, above which
+    presets begin: the value from which on something is visible.
 
     Each point is [value, red, green, blue, opacity]; all but the value are in 0..1. The opacity is that of a path of
     length ``unit_distance``, in units of the longest side of the volume. ``transfer: bone`` is short for
@@ -85,6 +86,7 @@ class TransferSettings(Settings):
     preset: Literal["bone", "soft_tissue", "skin", "vessels", "industrial"] | None = None
     low: Number | None = None
     high: Number | None = None
+    visible_from: Number | None = None
     file: ExistingPath | None = None
     points: tuple[tuple[Number, Number, Number, Number, Number], ...] | None = None
     unit_distance: Annotated[Number, Field(gt=0, le=1)] = 1 / 256
@@ -205,7 +207,14 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     if len(given) != 1:
         got = f"{' and '.join(given)}; 'transfer={{preset: bone}}' replaces the whole section" if given else "none"
         problems.append((("transfer",), f"expected one of preset, file or points, got {got}"))
-    if (transfer.low is None) != (transfer.high is None):
+    if transfer.visible_from is not None:
+        if transfer.preset is None or transfer.low is not None:
+            got = "no preset" if transfer.preset is None else "both"
+            problems.append((("transfer", "visible_from"), f"expected in place of the low of a preset, got {got}"))
+        elif transfer.high is not None and transfer.high <= transfer.visible_from:
+            text = f"expected less than transfer.high, {transfer.high:g}, got {transfer.visible_from:g}"
+            problems.append((("transfer", "visible_from"), text))
+    elif (transfer.low is None) != (transfer.high is None):
         problems.append((("transfer",), "expected both low and high, or neither: then they follow from the histogram"))
     if transfer.low is not None and transfer.high is not None and transfer.low >= transfer.high:
         problems.append((("transfer",), "a preset needs low < high, the values of the volume between which it lies"))

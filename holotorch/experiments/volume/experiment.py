@@ -175,15 +175,36 @@ class VolumeExperiment:
     @cached_property
     def transfer(self) -> TransferFunction:
         """Transfer function from a value of the volume to opacity and the colours that the wavelengths show."""
-        transfer = _transfer(self.settings.transfer, self.preset_range)
+        settings = self.settings.transfer
+        if settings.preset is None:
+            transfer = _transfer(settings)
+        else:
+            make = getattr(transfer_presets, settings.preset)
+            transfer = make(*self._range(make(0.0, 1.0).visible_from))
         return _shared(transfer, self.settings.wavelengths).to(self.device)
+
+    def _range(self, share: float) -> tuple[float, float]:
+        """Values between which a preset lies that shows nothing within this share of them."""
+        stated = self.settings.transfer
+        if stated.low is not None and stated.high is not None:
+            return stated.low, stated.high
+        if (begin := stated.visible_from) is None:
+            return self.histogram_range
+        high = self.histogram_range[1] if stated.high is None else stated.high
+        if begin >= high:
+            raise ValueError(f"transfer.visible_from must be below {high:g}, got {begin:g}; give transfer.high, too")
+        return (begin - share * high) / (1 - share), high
 
     @cached_property
     def preset_range(self) -> tuple[float, float] | None:
         """Range of a preset, from the histogram, if the configuration does not state it; None otherwise."""
         transfer = self.settings.transfer
-        if transfer.preset is None or transfer.low is not None:
-            return None
+        stated = transfer.low is not None or transfer.visible_from is not None
+        return None if transfer.preset is None or stated else self.histogram_range
+
+    @cached_property
+    def histogram_range(self) -> tuple[float, float]:
+        """Range of a preset that the histogram proposes. ValueError if all voxels have the same value."""
         from skimage.filters import threshold_otsu
 
         values = self.counted
@@ -496,9 +517,8 @@ def _shared(transfer: TransferFunction, wavelengths: Sequence[float]) -> Transfe
     return TransferFunction(transfer.positions, mixed, opacities, unit_distance=transfer.unit_distance)
 
 
-def _transfer(settings: TransferSettings, preset_range: tuple[float, float] | None) -> TransferFunction:
-    if settings.preset:
-        return getattr(transfer_presets, settings.preset)(*(preset_range or (settings.low, settings.high)))
+def _transfer(settings: TransferSettings) -> TransferFunction:
+    """Transfer function of a file or of points."""
     if settings.file:
         return transfer_presets.transfer_from_json(read_bytes(Path(settings.file)).decode("utf-8"))
     assert settings.points is not None

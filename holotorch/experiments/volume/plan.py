@@ -216,8 +216,7 @@ def preset_note(experiment: VolumeExperiment) -> str:
     if experiment.preset_range is None:
         return ""
     low, high = experiment.preset_range
-    transfer = experiment.transfer
-    hidden = float(transfer.positions[max(0, int((transfer.opacities > 0).to(torch.uint8).argmax()) - 1)])
+    hidden = experiment.transfer.visible_from
     preset, shown, values = experiment.settings.transfer.preset, experiment.background, experiment.counted
     note = (
         f"the preset {preset} lies between {low:.3g} and {high:.3g}, from the histogram, and shows nothing of values "
@@ -225,12 +224,10 @@ def preset_note(experiment: VolumeExperiment) -> str:
     )
     if shown is None or (faint := 1 - (values >= hidden).sum() / (values > shown).sum()) < _FAINT:
         return note
-    lower = low - (hidden - shown) * (high - low) / (high - hidden)  # the preset begins a fixed share above its low
     kind = " (in a patient, soft tissue)" if preset == "bone" else ""
     return (
         f"{note}; that hides {100 * faint:.2g} % of the voxels above {shown:.4g}, where the background ends{kind}; "
-        f"'transfer={{preset: {preset}, low: {lower:.4g}, high: {high:.4g}}}' "
-        "shows them, as the preset begins above its low"
+        f"'transfer={{preset: {preset}, visible_from: {shown:.4g}}}' shows them"
     )
 
 

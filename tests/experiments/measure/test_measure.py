@@ -33,13 +33,14 @@ def test_a_catheter_at_rest(tmp_path, capsys):
     summary = told(tmp_path / "a")
     assert summary["s_rms_mm"] == pytest.approx(1e3 * math.sqrt(sum(change) / len(change)), abs=1e-9)
     assert summary["differences"] == len(kept) and summary["answered"] == 397 and summary["notes"] == []
-    assert "(dissertation 0.33)" in capsys.readouterr().out
+    assert "(dissertation 0.33)" in (said := capsys.readouterr().out) and "that moves" not in said
     drift = np.linspace(0, 2e-3, 400)[:, None] * np.array([1.0, 0, 0])
     path = write(tmp_path / "drift.csv", np.array([0, 0, 0.5]) + noise + drift)
     assert main(["measure", "still", str(path), "--out", str(tmp_path / "b")]) == 0
     moved = told(tmp_path / "b")
     assert moved["s_rms_mm"] == pytest.approx(summary["s_rms_mm"], rel=0.05) and moved["sd_mm"] > 0.5
     assert "was the catheter at rest?" in moved["notes"][0]
+    assert "; a catheter that moves has no stability: see the Note" in capsys.readouterr().out
 
 
 def motion(seconds):

@@ -78,6 +78,36 @@ def test_a_note_on_a_preset_proposes_a_range_that_shows_what_it_hides(tmp_path, 
     assert "where the background ends (in a patient, soft tissue)" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("preset", ["bone", "soft_tissue", "skin", "vessels", "industrial"])
+@pytest.mark.parametrize("high", [None, 150])
+def test_a_preset_is_visible_from_the_value_that_is_asked_for(tmp_path, preset, high):
+    volume = plant(tmp_path / "plant.npy")
+    transfer = f"transfer={{preset: {preset}, visible_from: 70}}"
+    experiment = build(volume, transfer, *[f"transfer.high={high}"] * (high is not None))
+    end = high or 200  # the brightest are 200 to 202
+    values = torch.tensor([60.0, 69.9, 70.0, 70.1, 100.0])
+    assert (experiment.transfer(values)[1] > 0).tolist() == [False, False, False, True, True]
+    assert experiment.transfer.positions[-1].item() == pytest.approx(end, abs=2)
+    assert experiment.preset_range is None  # which the plan would say
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            "preset: bone, visible_from: 70, low: 3",
+            "transfer.visible_from: expected in place of the low of a preset, got",
+        ),
+        ("visible_from: 70, points: [[0, 1, 1, 1, 0], [1, 1, 1, 1, 1]]", "the low of a preset, got no preset"),
+        ("preset: bone, visible_from: 70, high: 60", "expected less than transfer.high, 60, got 70"),
+        ("preset: bone, visible_from: 700", "transfer.visible_from must be below 2"),
+    ],
+)
+def test_mistakes_of_what_is_visible_are_said(tmp_path, capsys, words, message):
+    assert main(["check", *TINY, plant(tmp_path / "plant.npy"), f"transfer={{{words}}}"]) == 2
+    assert message in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("noise", [0.5, 5.0, 20.0])
 def test_noise_alone_is_no_faint_tissue(tmp_path, capsys, noise):
     words = [plant(tmp_path / "plant.npy", faint=0, noise=noise), "transfer=soft_tissue"]
