@@ -15,6 +15,7 @@ from apart import start_apart
 from paths import CONFIGS
 
 from holotorch.cli import main
+from holotorch.experiments.registry import find_kind, load_config
 
 CONFIG = str(CONFIGS / "pec" / "fourier.yaml")
 TINY = ["grid.shape=[16,16]", "solver.max_steps=2"]
@@ -33,9 +34,12 @@ def test_run_prints_the_plan_and_ends_with_the_report(capsys):
 
 
 def test_check_computes_and_writes_nothing(capsys, tmp_path):
-    assert main(["check", CONFIG, "propagator={kind: fresnel, distance: 100 mm}"]) == 0
+    words = [CONFIG, "propagator={kind: fresnel, distance: 100 mm}"]
+    assert main(["check", *words]) == 0
     out = capsys.readouterr().out
-    assert "Planned    one propagation over this distance: cropped kernel on 256 x 256 samples is the cheapest" in out
+    kind = find_kind("pec")
+    single = kind.plan(kind.build(load_config(words[0], words[1:]))).values["single_propagation"]
+    assert "cropped kernel on 256 x 256 samples is the cheapest" in single["reason"]
     assert "paraxial kernel on twice the window" in out and "field of view" in out and "GB of memory" in out
     assert not list(tmp_path.iterdir())
 

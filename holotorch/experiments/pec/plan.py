@@ -120,11 +120,6 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
             f"sampled every {physics['pitch_um'][1]:.4g} um, which the array resolves up to "
             f"{physics['resolved_mm']:.3g} mm{blurred}{'' if experiment.isolated else periodic}"
         )
-    if planned := values.get("single_propagation"):
-        lines.append(
-            f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}"
-            "; in your own code, plan_propagation takes it: the run itself takes the propagator named above"
-        )
     if region := settings.target.region:
         lines.append(
             f"Region     the middle {region[0]} x {region[1]} px hold the picture; other pixels are not constrained"

@@ -70,7 +70,7 @@ def error_line(summary: dict[str, Any]) -> list[str]:
     parts = summary.get("errors", ())
     compared = sum(part["measured"] is not None for part in parts)
     words += f", {100 * predicted:.2g} % predicted"
-    words += f" in {compared} of its {len(parts)} parts" if 0 < compared < len(parts) else ""
+    words += f" in {compared} of {len(parts)} parts, the others unmeasured" if 0 < compared < len(parts) else ""
     return [f"Error      of the calculation itself: {words}; the report names its parts"]
 
 

@@ -132,7 +132,7 @@ def _notes(
         if count < _FEW and (x0, y0) == (x1, y1)
     ]
     notes += [
-        f"band {i} is overexposed: its hue is not known; use a shorter exposure"
+        f"band {i} is overexposed, so that its hue may be wrong; use a shorter exposure"
         for i, level in enumerate(levels, 1)
         if max(level) >= _BRIGHT
     ]

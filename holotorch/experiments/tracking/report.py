@@ -224,7 +224,7 @@ def refusals(summary: dict[str, Any]) -> list[str]:
         return []
     common = [each for each in refused if 2 * each["frames"] >= refused[0]["frames"]]
     few = summary["answered"] > _MANY * (summary["frames"] - summary["answered"])
-    advice = _ADVICE | ({Status.INCONSISTENT: _SINGLE} if few else {})
+    advice = _ADVICE | ({Status.INCONSISTENT: _SINGLE, Status.UNCERTAIN: _LONGER} if few else {})
     lines = [f"Refused    {each['frames']} like {each['first']}; {advice[Status[each['status']]]}" for each in common]
     if rest := summary["frames"] - summary["answered"] - sum(each["frames"] for each in common):
         lines[-1] += f"; {rest} more for other reasons (poses.csv)"

@@ -52,7 +52,7 @@ def test_errors_in_a_summary_and_in_words():
     assert "hologram 3.0e-03 predicted, 4.0e-03 measured" in sentence and "reference would take 90 s" in sentence
     assert error_values(parts[1:])["measured_error"] is None and error_sentence({}) == ""
     (partly,), (whole,) = error_line(values), error_line(error_values(parts[:1]))
-    assert f"predicted in 1 of its {len(parts)} parts; the report names its parts" in partly
+    assert f"predicted in 1 of {len(parts)} parts, the others unmeasured; the report names its parts" in partly
     assert "predicted; the report names its parts" in whole
 
 
