@@ -153,7 +153,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     lines.append(f"Methods    to the retina, by {_METHODS}")
     lines += _cheaper(eye, values["retina"])
     lines += colours_in_words("volume", eye.scene.settings.wavelengths)
-    each = "by colour, " if len(eye.scene.settings.wavelengths) > 1 else ""
+    by = "by colour, " if len(eye.scene.settings.wavelengths) > 1 else ""
     light = "; ".join(
         f"{name}: {plain(values['followed'][name])} of {plain(count)} wavelengths simulated"
         for name, count in values["wavelengths"].items()
@@ -164,7 +164,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         y, x = (1e3 * each for each in settings.eye.position)
         lines.append(f"Eye        beside the axis, at y {y:.3g} mm, x {x:.3g} mm; light below: for an eye on the axis")
     lines += [
-        f"Light      with the eye at {max(depths):.4g} mm, {each}{light}{others}{directions}",
+        f"Light      with the eye at {max(depths):.4g} mm, {by}{light}{others}{directions}",
         f"Phases     {settings.seeds} realisation(s) of the random phases, compared with the mean of "
         f"{8 * settings.seeds} others",
         eye.budget.text,

@@ -33,11 +33,11 @@ def fingerprint(
 
 
 def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
-    """A description of each key in which two fingerprints differ."""
+    """A description of each key in which two fingerprints differ; a missing key, of another version, counts as None."""
     lines = []
     for key in sorted({*before, *now}):
         old, new = (values.get(key, "nothing") for values in (before, now))
-        if old != new:
+        if before.get(key) != now.get(key):
             is_file = str(old).startswith(_PREFIX)
             lines.append(f"{key} has other contents" if is_file else f"{key} was {_short(old)} and is {_short(new)}")
     return lines

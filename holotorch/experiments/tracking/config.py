@@ -21,12 +21,12 @@ class TrackSettings(Settings):
     ``source``: a path, the index of a camera, or ``synthetic``. A synthetic run first renders a recording of
     ``frames`` frames with true poses, 45 by default; of other sources, all frames are tracked. ``camera``: YAML file of
     its intrinsics, as ``holotorch calibrate`` writes it; by default, that beside the recording, or a synthetic camera
-    if ``source`` is ``synthetic``. ``catheter``: YAML file of
-    its bands; by default, that beside the recording, or the dissertation's catheter. ``headset``: YAML file of the
-    camera's place on a headset; poses are also written in its frame. ``record``: save every frame without loss for a
-    later run. ``video``: write a video with the pose drawn on every frame; of a synthetic recording also one without.
-    ``still``: measure the tip's stability; the catheter must rest. ``rate_hz``: frames per second without time stamps.
-    ``batch``: frames that are tracked at a time; above 1, each is searched as a whole, without the pose before.
+    if ``source`` is ``synthetic``. ``catheter``: YAML file of its bands; by default, that beside the recording, or the
+    dissertation's catheter. ``headset``: YAML file of the camera's place on a headset; poses are also written in its
+    frame. ``record``: save every frame without loss for a later run. ``video``: write a video with the pose drawn on
+    every frame; of a synthetic recording also one without. ``still``: measure the tip's stability; the catheter must
+    rest. ``rate_hz``: frames per second without time stamps. ``batch``: frames that are tracked at a time; above 1,
+    each is searched as a whole, without the pose before.
     """
 
     experiment: Literal["track"]

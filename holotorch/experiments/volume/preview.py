@@ -21,7 +21,7 @@ _SHARES = (1, 25, 50, 75, 90, 95, 99, 99.9)  # percentiles that are listed
 def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
     """PNG of rendering and histogram, and lines with the percentiles of the values and the visible share."""
     values, air = experiment.counted, experiment.background
-    every = experiment.volume.values.numel() // len(values)
+    every = round(experiment.volume.values.numel() / len(values))
     border = "the smallest value" if air is None else f"{air:.4g}, where the background ends"
     above, of = values[values > (values.min() if air is None else air)], ""
     if air is not None or 0 < len(above) < len(values) / 2:  # without the air, which would hide all that is in it

@@ -196,3 +196,11 @@ def test_large_inputs_are_sampled_from_end_to_end(monkeypatch):
     assert differences(marks[None], marks[0]) == differences(marks[0], marks[9]) == ["target has other contents"]
     assert differences(marks[None], fingerprint(settings, {"target": (values.T.contiguous().T,)})) == []
     assert not any(key.startswith("target.") for key in marks[0]) and marks[0]["modulator.sigma_px"] == 0.66
+
+
+def test_a_key_of_a_later_version_that_is_not_given_changes_nothing():
+    before = {"transfer.preset": "bone", "transfer.low": None}
+    assert differences(before, before | {"transfer.visible_from": None}) == []
+    assert differences({"transfer.preset": "bone"}, before) == []
+    (line,) = differences(before, before | {"transfer.visible_from": 3.0})
+    assert line == "transfer.visible_from was nothing and is 3.0"
