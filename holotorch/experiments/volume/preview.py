@@ -1,7 +1,7 @@
 """A quick look at a volume: its values, the transfer function over them, and a rendering without any hologram."""
 
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -43,15 +43,23 @@ def preview(experiment: VolumeExperiment) -> tuple[bytes, str]:
 
 
 def _standing(experiment: VolumeExperiment) -> dict[str, torch.Tensor]:
-    """Renderings of an own scan by ``view.up``, without its lighting; ``head`` if the file names a patient's sides."""
+    """Renderings of an own scan, unlit, by title: for each ``view.up``, and from behind.
+
+    There is one for ``head`` if the file names the sides of a patient.
+    """
     settings, pictures = experiment.settings, dict[str, torch.Tensor]()
     if not settings.volume.path:
         return pictures
-    for up in get_args(ViewSettings.model_fields["up"].annotation):
-        if up != "head" or experiment.volume.frame not in ("", "xyz"):
-            view = settings.view.model_copy(update={"up": up, "samples": experiment.samples})
-            turned = replace(experiment, settings=settings.model_copy(update={"view": view}))
-            pictures[up] = turned.quick_rendering(_SMALL, lit=False)
+    behind = settings.view.azimuth_deg + 180
+    changes: dict[str, dict[str, Any]] = {
+        f"view.up={up}" + " (above)" * (up == settings.view.up): {"up": up}
+        for up in get_args(ViewSettings.model_fields["up"].annotation)
+        if up != "head" or experiment.volume.frame not in ("", "xyz")
+    } | {f"azimuth_deg={behind:g}": {"azimuth_deg": behind}}
+    for title, change in changes.items():
+        view = settings.view.model_copy(update={**change, "samples": experiment.samples})
+        turned = replace(experiment, settings=settings.model_copy(update={"view": view}))
+        pictures[title] = turned.quick_rendering(_SMALL, lit=False)
     return pictures
 
 
@@ -62,9 +70,9 @@ def _drawn(experiment: VolumeExperiment, values: np.ndarray, picture: torch.Tens
     upper = rows[0].subgridspec(1, 2, width_ratios=(1, 1.5))
     left, right = figure.add_subplot(upper[0]), figure.add_subplot(upper[1])
     _show(left, experiment, picture, "rendering, brightest pixel white")
-    for k, (up, other) in enumerate(others.items()):
+    for k, (title, other) in enumerate(others.items()):
         axes = figure.add_subplot(rows[1].subgridspec(1, len(others))[k])
-        _show(axes, experiment, other, f"view.up={up}" + " (above)" * (up == experiment.settings.view.up))
+        _show(axes, experiment, other, title)
     counts, edges = np.histogram(values, 256)
     right.stairs(np.maximum(counts, 0.5), edges, fill=True, color="0.75")
     right.set(yscale="log", xlabel="value of the volume", ylabel="voxels (of those counted)")
