@@ -13,6 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from holotorch.experiments.runs.signals import delayed
+
 
 def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str, limits=(None, None)) -> bytes:
     """PNG of maps [C, H, W] side by side, each with a colour bar; ``label`` names the quantity and its unit."""
@@ -212,7 +214,11 @@ def mark_choice(axes: Axes, points: Iterable[tuple[float, float]], label: str = 
 
 
 def figure_png(figure: Figure) -> bytes:
-    """Render a figure as PNG, without any global state of matplotlib."""
+    """Render a figure as PNG, without any global state of matplotlib.
+
+    Signals wait until it is drawn: the compiled part of matplotlib replaces their exception by a ValueError.
+    """
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
+    with delayed():
+        FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()

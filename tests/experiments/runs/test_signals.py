@@ -6,8 +6,11 @@ import time
 
 import pytest
 import torch
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from holotorch.experiments.runs import saving
+from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.runs.saving import Checkpoint
 from holotorch.experiments.runs.signals import interruptible
 
@@ -60,3 +63,21 @@ def test_other_dropped_exceptions_are_reported_as_before(monkeypatch):
     with interruptible() as signals:
         Gone(ValueError)
     assert dropped == [ValueError] and not signals and sys.unraisablehook is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_figure_is_drawn_takes_effect_when_it_is_whole(number, monkeypatch):
+    """An exception within the compiled part of matplotlib comes out as a ValueError (a find of scripts/kills.py)."""
+    draw, drawn = Line2D.draw, []
+
+    def interrupted(line, renderer):
+        signal.raise_signal(number)
+        draw(line, renderer)
+        drawn.append(True)
+
+    monkeypatch.setattr(Line2D, "draw", interrupted)
+    figure = Figure()
+    figure.add_artist(Line2D([0, 1], [0, 1], marker="o"))
+    with pytest.raises(KeyboardInterrupt), interruptible() as signals:
+        figure_png(figure)
+    assert drawn == [True] and signals == [number]
