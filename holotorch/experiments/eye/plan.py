@@ -180,7 +180,8 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
     if settings.tradeoff:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  in addition, at {where} mm, by the method collapse; the cost above excludes it")
-    lines += [f"Note       {note}" for note in filter(None, (volume_plan.preset_note(eye.scene),))]
+    if note := volume_plan.preset_note(eye.scene):
+        lines.append(f"Note       {note}")
     first = len(eye_geometry.warnings(values["geometry"]))  # printed above, with the numbers of the geometry
     return "\n".join([*lines, *(f"WARNING    {warning}" for warning in values["warnings"][first:])])
 
